@@ -1,0 +1,72 @@
+"""A radio interferometer as an object composed of Jones terms, and its errors followed the whole way.
+
+Everything a script needs is importable from here; modules are loaded when a name is first used.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Component": "component",
+    "available": "registry",
+    "load": "registry",
+    "InputError": "errors",
+    "InstrumentError": "errors",
+    "InstrumentWarning": "errors",
+    "Outcome": "errors",
+    "Direction": "units",
+    "Layout": "observe.layout",
+    "Observation": "observe.observation",
+    "Sampling": "observe.sampling",
+    "Sky": "sky.base",
+    "PointSky": "sky.points",
+    "JonesTerm": "jones.base",
+    "ScalarTerm": "jones.base",
+    "ElementBeam": "jones.base",
+    "Simplified": "jones.base",
+    "Chain": "jones.chain",
+    "GainTerm": "jones.gain",
+    "FeedTerm": "jones.feed",
+    "Parallactic": "jones.parallactic",
+    "StationBeam": "jones.station",
+    "ArrayFactor": "jones.station",
+    "Level": "jones.station",
+    "Towards": "jones.towards",
+    "Instrument": "model",
+    "Composed": "model",
+    "Predictor": "predict.base",
+    "Scene": "scene",
+    "Plan": "plan",
+    "Visibilities": "visibilities",
+    "BeamState": "visibilities",
+    "Imager": "image.dirty",
+    "StokesCube": "image.cube",
+    "Analyzer": "analyze.analyzer",
+    "Leakage": "analyze.leakage",
+}
+_MODULES = ("conformance", "mueller", "units")
+__all__ = [*_HOME, *_MODULES, "__version__"]
+
+if TYPE_CHECKING:
+    from instrument.component import Component as Component
+    from instrument.errors import InputError as InputError
+    from instrument.registry import available as available
+    from instrument.registry import load as load
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        found = getattr(import_module(f"instrument.{_HOME[name]}"), name)
+        globals()[name] = found
+        return found
+    if name in _MODULES:
+        return import_module("instrument.jones.mueller" if name == "mueller" else f"instrument.{name}")
+    raise AttributeError(f"module 'instrument' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,1 @@
+"""Analysis of images and visibilities: leakage of sources."""

@@ -1,0 +1,170 @@
+"""`Component`: the frozen, unit-aware, JSON-able base of everything a user can compose."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+from abc import ABC
+from collections.abc import Mapping
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    ModelWrapValidatorHandler,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
+
+from instrument.errors import InputError, did_you_mean
+
+TAG = "component"
+
+
+class Component(BaseModel, ABC):
+    """A frozen set of named, validated settings; equal when its fields are equal.
+
+    A subclass is abstract or final. Fields are given by keyword with their units; wrong input raises `InputError` in
+    one line. `to_json` writes the class beside the fields, `from_json` gives the same subclass back. A field that is
+    typed with an abstract component also takes the name of a plugin when the class names its `plugin_kind`.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True, populate_by_name=True)
+    plugin_kind: ClassVar[str | None] = None
+
+    def __init__(self, /, **fields: Any) -> None:
+        try:
+            super().__init__(**fields)
+        except ValidationError as error:
+            raise InputError(one_line(type(self), error)) from None
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _right_subclass(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        if isinstance(data, str) and cls.plugin_kind:
+            from instrument.registry import load
+
+            return _checked(load(cls.plugin_kind, data), cls)
+        if isinstance(data, Mapping) and TAG in data:
+            found = _class_of(str(data[TAG]), cls)
+            fields = {k: v for k, v in data.items() if k != TAG}
+            return handler(fields) if found is cls else found(**fields)
+        return handler(data)
+
+    @model_serializer(mode="wrap")
+    def _with_tag(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {TAG: f"{type(self).__module__}:{type(self).__qualname__}", **handler(self)}
+
+    def to_json(self, indent: int | None = None) -> str:
+        """The component as JSON text; every value with a unit is a string with that unit."""
+        return json.dumps(self.to_dict(), indent=indent)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The component as plain dictionaries, lists, strings and numbers."""
+        return self.model_dump(mode="json")
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """Inverse of `to_json`; raises `InputError` when the text is not a component of this class."""
+        try:
+            data = json.loads(text)
+        except json.JSONDecodeError as error:
+            raise InputError(f"not JSON: {error}") from None
+        try:
+            return cls.model_validate(data)
+        except ValidationError as error:
+            raise InputError(one_line(cls, error)) from None
+
+    def with_fields(self, **fields: Any) -> Self:
+        """A copy with some fields given anew, validated like the first time."""
+        kept = {k: getattr(self, k) for k in type(self).model_fields if k not in fields}
+        for name, value in kept.items():
+            kept[name] = _at_the_door(type(self), name, value)
+        return type(self)(**kept, **fields)
+
+    def fingerprint(self) -> str:
+        """Hex digest of the fields: equal components have equal fingerprints."""
+        return hashlib.sha256(self.to_json().encode()).hexdigest()[:16]
+
+    def __eq__(self, other: object) -> bool:
+        if type(other) is not type(self):
+            return NotImplemented
+        return all(_same(getattr(self, k), getattr(other, k)) for k in type(self).model_fields)
+
+    def __hash__(self) -> int:
+        return hash(self.fingerprint())
+
+
+def _at_the_door(cls: type[Component], name: str, value: Any) -> Any:
+    """A stored SI value as it would be given: with its unit."""
+    from instrument.units import In
+
+    for mark in cls.model_fields[name].metadata:
+        if isinstance(mark, In) and value is not None:
+            from astropy import units as u
+
+            return u.Quantity(value, mark.unit)
+    return value
+
+
+def _same(a: Any, b: Any) -> bool:
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        return (
+            isinstance(a, np.ndarray)
+            and isinstance(b, np.ndarray)
+            and np.array_equal(a, b, equal_nan=a.dtype.kind in "fc")
+        )
+    if isinstance(a, tuple | list) and isinstance(b, tuple | list):
+        return len(a) == len(b) and all(_same(x, y) for x, y in zip(a, b, strict=True))
+    return bool(a == b)
+
+
+def _checked(found: Any, wanted: type[Any]) -> Any:
+    if not isinstance(found, wanted):
+        raise InputError(f"{type(found).__name__} is not a {wanted.__name__}")
+    return found
+
+
+def _class_of(tag: str, wanted: type[Component]) -> type[Any]:
+    module, _, name = tag.partition(":")
+    try:
+        found: Any = importlib.import_module(module)
+        for part in name.split("."):
+            found = getattr(found, part)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise InputError(f"component '{tag}' cannot be imported: {error}") from None
+    if not (isinstance(found, type) and issubclass(found, wanted)):
+        raise InputError(f"component '{tag}' is not a {wanted.__name__}")
+    return found
+
+
+def one_line(cls: type[BaseModel], error: ValidationError) -> str:
+    """A pydantic error as one line: the field, the value and the remedy."""
+    parts = []
+    for item in error.errors():
+        where = ".".join(str(p) for p in item["loc"])
+        kind, message = item["type"], item["msg"].removeprefix("Value error, ")
+        if kind == "extra_forbidden":
+            known = _fields_at(cls, item["loc"][:-1])
+            parts.append(f"{cls.__name__} has no '{where}': {did_you_mean(str(item['loc'][-1]), known)}")
+        elif kind == "missing":
+            parts.append(f"{cls.__name__} needs '{where}'")
+        elif kind == "value_error":
+            inside = where and not message.startswith(where) and str(item["loc"][-1]) not in message
+            parts.append(f"{where}: {message}" if inside else message)
+        else:
+            parts.append(f"{where} = {item['input']!r}: {message[:1].lower()}{message[1:]}")
+    return "; ".join(parts)
+
+
+def _fields_at(cls: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
+    fields: Any = cls
+    for step in path:
+        info = getattr(fields, "model_fields", {}).get(step)
+        options = [info.annotation, *getattr(info.annotation, "__args__", ())] if info else []
+        fields = next((o for o in options if hasattr(o, "model_fields")), None)
+    return list(getattr(fields, "model_fields", {}))

@@ -1,0 +1,1 @@
+"""Catalogues, sky models and tables that the framework carries; provenance in README.md beside them."""

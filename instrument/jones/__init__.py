@@ -1,0 +1,1 @@
+"""Jones terms: gains, feeds, element and station beams, parallactic rotation, and chains of them."""

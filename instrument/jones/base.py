@@ -1,0 +1,92 @@
+"""JonesTerm: one effect of the instrument, as 2x2 matrices per time, channel, station and direction."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import ClassVar, Literal, NamedTuple
+
+import numpy as np
+
+from instrument import mat2
+from instrument.component import Component
+from instrument.observe.sampling import Sampling
+from instrument.units import Complex
+
+Basis = Literal["sky", "horizon", "feed"]
+Structure = Literal["scalar", "diagonal", "full"]
+PerStation = Literal["shared", "frame", "own"]
+
+
+class Simplified(NamedTuple):
+    """What is left of a term for a scene: the term or `None`, why, and the bound on the relative error of J."""
+
+    term: JonesTerm | None
+    reason: str
+    bound: float
+
+
+class JonesTerm(Component):
+    """One effect as Jones matrices, complex (T, F, A, S, 2, 2), axes of length 1 where it is constant.
+
+    A new effect is a subclass with `maps` and `jones`. `maps` names the basis it takes and the one it gives ("sky": x
+    north, y east at each source; "horizon": e_theta away from the zenith and e_phi; "feed": the receptors). The other
+    class attributes say what may be left out, and are checked by `instrument.conformance`:
+
+    - `structure`: "scalar" (a number times the identity), "diagonal" or "full";
+    - `per_station`: "own" (may differ for every station), "frame" (depends on a station only through its axes) or
+      "shared" (the same for all);
+    - `directional`: False when it is the same for every direction.
+    """
+
+    maps: ClassVar[tuple[Basis, Basis]]
+    structure: ClassVar[Structure] = "full"
+    per_station: ClassVar[PerStation] = "own"
+    directional: ClassVar[bool] = True
+    blind_below_horizon: ClassVar[bool] = False
+
+    @abstractmethod
+    def jones(self, at: Sampling) -> Complex:
+        """Jones matrices (T, F, A, S, 2, 2), length 1 where constant."""
+
+    def scalar(self, at: Sampling) -> Complex:
+        """The factor (T, F, A, S) of a term whose structure is "scalar"."""
+        return self.jones(at)[..., 0, 0]
+
+    def parts(self) -> tuple[JonesTerm, ...]:
+        """The terms this one is the product of, receiver to sky; itself unless it is a composite."""
+        return (self,)
+
+    def simplify(self, at: Sampling, tolerance: float) -> Simplified:
+        """What a scene needs of this term: itself, something simpler, or nothing, with a bound on the error."""
+        return Simplified(self, "", 0.0)
+
+
+class ScalarTerm(JonesTerm):
+    """A term that is a number times the identity: a subclass gives `scalar`, complex (T, F, A, S)."""
+
+    structure: ClassVar[Structure] = "scalar"
+
+    @abstractmethod
+    def scalar(self, at: Sampling) -> Complex:
+        """The factor (T, F, A, S), length 1 where constant."""
+
+    def jones(self, at: Sampling) -> Complex:
+        """The factor times the identity, (T, F, A, S, 2, 2)."""
+        return np.asarray(self.scalar(at)[..., None, None] * mat2.IDENTITY)
+
+
+class ElementBeam(JonesTerm):
+    """One antenna's pattern, horizon to feed, (T, F, A, S, 2, 2); zero below the antenna plane.
+
+    A subclass gives `jones`; `at.zenith_angle` and `at.azimuth_cos_sin` are in the axes of each station. Columns are
+    the field along e_theta (away from the zenith) and e_phi (azimuth increasing from p, east, to q, north).
+    """
+
+    plugin_kind: ClassVar[str | None] = "elements"
+    maps: ClassVar[tuple[Basis, Basis]] = ("horizon", "feed")
+    per_station: ClassVar[PerStation] = "frame"
+    blind_below_horizon: ClassVar[bool] = True
+
+    def band_hz(self) -> tuple[float, float]:
+        """Frequencies between which the model was made; outside it extrapolates."""
+        return 0.0, float("inf")

@@ -1,0 +1,105 @@
+"""Chain: Jones terms in order, receiver to sky, their bases checked, their product and its cheap factors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, reduce
+from typing import Any, Self
+
+import numpy as np
+from pydantic import SerializeAsAny, model_validator
+
+from instrument import mat2
+from instrument.component import Component
+from instrument.errors import BasisError
+from instrument.jones.base import JonesTerm, Structure
+from instrument.observe.sampling import Sampling
+from instrument.units import Complex, Int
+
+RANK: dict[str, int] = {"scalar": 0, "diagonal": 1, "full": 2}
+
+
+@dataclass(frozen=True)
+class Factors:
+    """J_a = outer_a * scalar_a * shared_group(a), each `None` where it is 1.
+
+    outer (T, F, A, 1, 2, 2), the same for every direction; scalar (T, F, A, S); shared (T, F, G, S, 2, 2) with the
+    group (A,) of every station. The limit of cost is set by G, not by the number of stations.
+    """
+
+    outer: Complex | None
+    scalar: Complex | None
+    shared: Complex | None
+    group: Int
+
+
+class Chain(Component):
+    """Product of Jones terms, (T, F, A, S, 2, 2), written from receiver to sky: `Chain(GainTerm(), StationBeam())`."""
+
+    terms: tuple[SerializeAsAny[JonesTerm], ...] = ()
+
+    def __init__(self, *terms: JonesTerm, **fields: Any) -> None:
+        super().__init__(**({"terms": terms} if terms else {}), **fields)
+
+    @model_validator(mode="after")
+    def _bases_meet(self) -> Self:
+        for left, right in zip(self.terms[:-1], self.terms[1:], strict=True):
+            if left.maps[0] != right.maps[1]:
+                raise BasisError(
+                    f"{type(left).__name__} takes '{left.maps[0]}' but {type(right).__name__} gives '{right.maps[1]}'; "
+                    "write terms from receiver to sky"
+                )
+        return self
+
+    @cached_property
+    def parts(self) -> tuple[JonesTerm, ...]:
+        """The terms with composites taken apart."""
+        return tuple(p for term in self.terms for p in term.parts())
+
+    @property
+    def structure(self) -> Structure:
+        """The least special structure among the terms; "scalar" for an empty chain."""
+        return max((t.structure for t in self.parts), key=RANK.__getitem__, default="scalar")
+
+    @property
+    def blind_below_horizon(self) -> bool:
+        """Whether the product is exactly zero for directions below the antenna plane."""
+        return any(t.blind_below_horizon for t in self.parts)
+
+    def jones(self, at: Sampling) -> Complex:
+        """The plain product of the terms, (T, F, A, S, 2, 2), length 1 where constant: the definition."""
+        if not self.terms:
+            return np.array(mat2.IDENTITY).reshape(1, 1, 1, 1, 2, 2)
+        return reduce(mat2.mul, (term.jones(at) for term in self.terms))
+
+    def shares(self, layout: Any) -> int:
+        """Number G of different shared matrices for the stations of `layout`."""
+        kinds = {t.per_station for t in self._shared_terms()}
+        return len(layout) if "own" in kinds else len(layout.frames[0]) if "frame" in kinds else 1
+
+    def _outer_count(self) -> int:
+        return next((i for i, t in enumerate(self.parts) if t.directional), len(self.parts))
+
+    def _shared_terms(self) -> list[JonesTerm]:
+        return [t for t in self.parts[self._outer_count() :] if t.structure != "scalar"]
+
+    def factors(self, at: Sampling) -> Factors:
+        """The product as cheap factors; equal to `jones` (tests/accuracy/test_agreement.py)."""
+        split = self._outer_count()
+        outer = [t.jones(at) for t in self.parts[:split]]
+        scalars = [t.scalar(at) for t in self.parts[split:] if t.structure == "scalar"]
+        matrices = self._shared_terms()
+        group = np.zeros(len(at.layout), int)
+        where = at
+        kinds = {t.per_station for t in matrices}
+        if "own" in kinds:
+            group = np.arange(len(at.layout))
+        elif "frame" in kinds:
+            group = at.layout.frames[1]
+            where = at.one_per_frame()
+        return Factors(
+            outer=reduce(mat2.mul, outer) if outer else None,
+            scalar=reduce(np.multiply, scalars) if scalars else None,
+            shared=reduce(mat2.mul, (t.jones(where) for t in matrices)) if matrices else None,
+            group=group,
+        )

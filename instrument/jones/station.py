@@ -1,0 +1,105 @@
+"""StationBeam: an element beam phased over dipoles, tiles and stations; ArrayFactor, its scalar part."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Annotated, Any, ClassVar, Self
+
+import numpy as np
+from pydantic import SerializeAsAny, model_validator
+
+from instrument.component import Component
+from instrument.errors import InputError
+from instrument.jones.base import Basis, ElementBeam, JonesTerm, PerStation, ScalarTerm
+from instrument.observe.directions import LIGHT
+from instrument.observe.sampling import Sampling
+from instrument.phasor import array_factor
+from instrument.units import ArrayOf, Complex, Float, Hertz, Int, SkyDirection
+
+Offsets = Annotated[Any, ArrayOf(float, (None, None, 3))]
+
+
+class Level(Component):
+    """One level of a phased station: M parts at ITRF offsets in m (A or 1, M, 3), steered to `pointing`.
+
+    `pointing` defaults to the phase centre. A HBA station has two levels: tiles about the station's centre, dipoles
+    about a tile's centre.
+    """
+
+    offsets_m: Offsets
+    pointing: SkyDirection | None = None
+
+    @model_validator(mode="after")
+    def _has_parts(self) -> Self:
+        if self.offsets_m.shape[1] == 0 or not np.all(np.isfinite(self.offsets_m)):
+            raise InputError("a level of a phased station needs at least one part, at finite offsets")
+        return self
+
+    @cached_property
+    def distinct(self) -> tuple[Float, Int]:
+        """The different layouts (U, M, 3) among the stations, and which one each station has (A or 1,)."""
+        flat = self.offsets_m.reshape(len(self.offsets_m), -1)
+        _, first, which = np.unique(flat, axis=0, return_index=True, return_inverse=True)
+        return self.offsets_m[first], which.reshape(-1)
+
+
+class ArrayFactor(ScalarTerm):
+    """Product over levels of mean exp(2 pi i (f d - f0 d0) . r / c), complex (T, F, A, S); 1 at the pointing.
+
+    d is the apparent direction, d0 the pointing of the level, f0 the channel frequency, or `reference_frequency` where
+    a beam former works with one set of phases for a whole band. The same factor for both receptors. Not clipped at the
+    horizon. Source: docs/conventions.md; checked against EveryBeam in tests/peers.
+    """
+
+    maps: ClassVar[tuple[Basis, Basis]] = ("feed", "feed")
+    levels: tuple[Level, ...]
+    reference_frequency: Hertz | None = None
+
+    def scalar(self, at: Sampling) -> Complex:
+        """The array factor (T, F, A, S)."""
+        out: Any = np.ones((1, 1, 1, 1))
+        times, channels, _, sources = at.shape
+        for level in self.levels:
+            steer = at.centre_itrf if level.pointing is None else at.earth.itrf(level.pointing.vector[None])[:, 0]
+            f0 = np.full(channels, self.reference_frequency) if self.reference_frequency else at.freq_hz
+            waves = (at.freq_hz[:, None, None] * at.itrf[:, None] - (f0[:, None] * steer[:, None])[:, :, None]) / LIGHT
+            offsets, which = level.distinct
+            if len(which) not in (1, len(at.layout)):
+                raise InputError(f"a level holds {len(which)} stations, the array has {len(at.layout)}")
+            factor = array_factor(np.swapaxes(waves, 2, 3).reshape(-1, 3, sources), offsets)
+            out = out * factor.reshape(times, channels, -1, sources)[:, :, which]
+        return np.asarray(out)
+
+    @property
+    def distinct_count(self) -> int:
+        """How many different array factors the stations have between them."""
+        which = np.stack(np.broadcast_arrays(*(level.distinct[1] for level in self.levels)), axis=1)
+        return len(np.unique(which, axis=0))
+
+
+class StationBeam(JonesTerm):
+    """A phased station, horizon to feed, (T, F, A, S, 2, 2): `ArrayFactor` times the element's pattern."""
+
+    maps: ClassVar[tuple[Basis, Basis]] = ("horizon", "feed")
+    per_station: ClassVar[PerStation] = "own"
+    blind_below_horizon: ClassVar[bool] = True
+
+    element: SerializeAsAny[ElementBeam]
+    levels: tuple[Level, ...]
+    reference_frequency: Hertz | None = None
+
+    @cached_property
+    def array(self) -> ArrayFactor:
+        """The scalar part."""
+        from astropy import units as u
+
+        reference = self.reference_frequency and self.reference_frequency * u.Hz
+        return ArrayFactor(levels=self.levels, reference_frequency=reference)
+
+    def parts(self) -> tuple[JonesTerm, ...]:
+        """(ArrayFactor, element)."""
+        return (self.array, *self.element.parts())
+
+    def jones(self, at: Sampling) -> Complex:
+        """Array factor times element, (T, F, A, S, 2, 2)."""
+        return np.asarray(self.array.scalar(at)[..., None, None] * self.element.jones(at))

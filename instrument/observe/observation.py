@@ -1,0 +1,76 @@
+"""Observation: towards where, when, and at which frequencies."""
+
+from __future__ import annotations
+
+from typing import Any, Self
+
+import numpy as np
+from pydantic import model_validator
+
+from instrument.component import Component
+from instrument.errors import InputError
+from instrument.observe.directions import transit_time
+from instrument.observe.layout import Layout
+from instrument.units import Float, Hertz, HertzArray, Instant, Seconds, SkyDirection
+
+
+class Observation(Component):
+    """A phase centre tracked for `duration` in integrations of `interval`, at channel centres `frequencies`.
+
+    Give `start` (UTC, the beginning of the first integration) or `transit` (a UTC day, "2012-12-07": the observation is
+    centred on the culmination of the phase centre within that day). `channel_width` is that of one channel; where it is
+    not given, it is the spacing of the channels.
+    """
+
+    phase_centre: SkyDirection
+    start: Instant | None = None
+    transit: str | None = None
+    duration: Seconds
+    interval: Seconds
+    frequencies: HertzArray
+    channel_width: Hertz | None = None
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        if (self.start is None) == (self.transit is None):
+            raise InputError("an observation needs 'start' or 'transit', and not both")
+        if self.interval <= 0:
+            raise InputError(f"interval = {self.interval:g} s must be positive")
+        if self.duration < self.interval:
+            raise InputError(f"duration = {self.duration:g} s is shorter than one interval of {self.interval:g} s")
+        if self.frequencies.size == 0 or np.any(self.frequencies <= 0):
+            raise InputError("frequencies must be positive, and at least one")
+        if np.unique(self.frequencies).size != self.frequencies.size:
+            raise InputError("frequencies holds the same channel twice")
+        if self.channel_width is not None and self.channel_width <= 0:
+            raise InputError(f"channel_width = {self.channel_width:g} Hz must be positive")
+        return self
+
+    @property
+    def count(self) -> int:
+        """Number of integrations."""
+        return max(1, round(self.duration / self.interval))
+
+    @property
+    def width_hz(self) -> float | None:
+        """Width of a channel: given, or the smallest spacing of channels; `None` for one channel without a width."""
+        if self.channel_width is not None:
+            return self.channel_width
+        return float(np.diff(np.sort(self.frequencies)).min()) if self.frequencies.size > 1 else None
+
+    @property
+    def freq_hz(self) -> Float:
+        """Channel centres in Hz (F,)."""
+        return np.asarray(self.frequencies)
+
+    def times(self, layout: Layout) -> Any:
+        """Centres of the integrations, UTC `Time` (T,); the layout says where "transit" is."""
+        from astropy import units as u
+
+        if self.transit is not None:
+            begin = (
+                transit_time(self.phase_centre, layout.centre_m, self.transit) - self.count * self.interval / 2 * u.s
+            )
+        else:
+            begin = self.start
+        return begin + (np.arange(self.count) + 0.5) * self.interval * u.s

@@ -1,0 +1,147 @@
+"""Sampling: the times, channels, stations and directions at which Jones terms and skies are asked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from instrument.observe.directions import EarthFrame, earth_frame, lmn, tangents
+from instrument.observe.layout import Layout
+from instrument.units import Direction, Float, unit_vectors
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """Where a Jones term is evaluated: T times, F channels, A stations, S directions.
+
+    Everything geometric is worked out when asked for, once. `seen` and `seen_east` override the directions (ITRF unit
+    vectors and the east vectors across them, (T, S, 3)) for work with another program's frames.
+    """
+
+    layout: Layout
+    earth: EarthFrame
+    slots_s: Float  # (T,) MJD seconds, UTC: names an integration, used for interpolation and for seeds
+    freq_hz: Float  # (F,)
+    ra_rad: Float  # (S,)
+    dec_rad: Float  # (S,)
+    centre: Direction
+    seen: Float | None = None
+    seen_east: Float | None = None
+
+    @classmethod
+    def build(
+        cls, layout: Layout, times: Any, freq_hz: Float, ra_rad: Float, dec_rad: Float, centre: Direction
+    ) -> Sampling:
+        """Sampling at astropy `times` (T,), for ICRS directions (S,) in rad."""
+        return cls(
+            layout=layout,
+            earth=earth_frame(times, layout.centre_m),
+            slots_s=mjd_seconds(times),
+            freq_hz=np.atleast_1d(np.asarray(freq_hz, float)),
+            ra_rad=np.atleast_1d(np.asarray(ra_rad, float)),
+            dec_rad=np.atleast_1d(np.asarray(dec_rad, float)),
+            centre=centre,
+        )
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """(T, F, A, S)."""
+        return len(self.earth), len(self.freq_hz), len(self.layout), len(self.ra_rad)
+
+    def block(self, times: slice, channels: slice) -> Sampling:
+        """The same for some times and channels."""
+        return replace(
+            self,
+            earth=self.earth[times],
+            slots_s=self.slots_s[times],
+            freq_hz=self.freq_hz[channels],
+            seen=None if self.seen is None else self.seen[times],
+            seen_east=None if self.seen_east is None else self.seen_east[times],
+        )
+
+    def towards(self, ra_rad: Float, dec_rad: Float) -> Sampling:
+        """The same for other directions, ICRS rad (S,)."""
+        return replace(self, ra_rad=np.atleast_1d(ra_rad), dec_rad=np.atleast_1d(dec_rad), seen=None, seen_east=None)
+
+    def at_centre(self) -> Sampling:
+        """The same for the phase centre alone."""
+        return self.towards(np.array([self.centre.ra_rad]), np.array([self.centre.dec_rad]))
+
+    def one_per_frame(self) -> Sampling:
+        """The same for one station of each distinct set of axes (`layout.frames`)."""
+        first, _ = self.layout.frames
+        if len(first) == len(self.layout):
+            return self
+        return replace(self, layout=_Axes(self.layout.axes[first]))  # type: ignore[arg-type]
+
+    @cached_property
+    def vectors(self) -> Float:
+        """ICRS unit vectors of the directions (S, 3)."""
+        return unit_vectors(self.ra_rad, self.dec_rad)
+
+    @cached_property
+    def itrf(self) -> Float:
+        """Apparent ITRF unit vectors (T, S, 3)."""
+        return self.earth.itrf(self.vectors) if self.seen is None else self.seen
+
+    @cached_property
+    def centre_itrf(self) -> Float:
+        """Apparent ITRF unit vector of the phase centre (T, 3)."""
+        return self.earth.itrf(self.centre.vector[None])[:, 0]
+
+    @cached_property
+    def east_itrf(self) -> Float:
+        """ITRF unit vectors east of each source, across the line of sight (T, S, 3); north is d x east."""
+        if self.seen_east is not None:
+            return self.seen_east
+        return self.earth.carried(tangents(self.ra_rad, self.dec_rad)[0], self.itrf)
+
+    @cached_property
+    def local(self) -> Float:
+        """Apparent unit vectors in the axes (p, q, r) of the stations, (T, A, S, 3)."""
+        axes = self.layout.axes
+        return np.asarray(self.itrf[:, None] @ np.swapaxes(axes, 1, 2)[None])
+
+    @cached_property
+    def zenith_angle(self) -> Float:
+        """Angle from the normal of the antenna plane, rad (T, A, S)."""
+        p, q, r = np.moveaxis(self.local, -1, 0)
+        return np.arctan2(np.hypot(p, q), r)
+
+    @cached_property
+    def azimuth_cos_sin(self) -> tuple[Float, Float]:
+        """Cosine and sine of the azimuth counted from p (east) to q (north), (T, A, S); (1, 0) at the zenith."""
+        p, q, _ = np.moveaxis(self.local, -1, 0)
+        rho = np.hypot(p, q)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.where(rho > 0, p / rho, 1.0), np.where(rho > 0, q / rho, 0.0)
+
+    @cached_property
+    def lmn(self) -> Float:
+        """Direction cosines l, m and n - 1 about the phase centre (S, 3)."""
+        return lmn(self.vectors, self.centre)
+
+    @cached_property
+    def uvw_m(self) -> Float:
+        """Station coordinates u, v, w in m about the array's centre (T, A, 3); u_ab = u_a - u_b."""
+        relative = self.layout.positions_m - self.layout.centre_m
+        return relative[None] @ np.swapaxes(self.earth.uvw_axes(self.centre), 1, 2)
+
+
+@dataclass(frozen=True)
+class _Axes:
+    """Stands for a layout where only the axes of its stations matter (one station of each frame)."""
+
+    axes: Float
+
+    def __len__(self) -> int:
+        return len(self.axes)
+
+
+def mjd_seconds(times: Any) -> Float:
+    """UTC times as MJD seconds (T,), 1 microsecond resolution."""
+    utc = times.utc
+    return np.atleast_1d((utc.jd1 - 2400000.5) * 86400.0 + utc.jd2 * 86400.0)

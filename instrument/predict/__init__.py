@@ -1,0 +1,1 @@
+"""Engines that predict visibilities: `direct` is the definition, the others are fast."""

@@ -1,0 +1,34 @@
+"""Scene: an instrument looking at a sky during an observation; from it comes the plan."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import SerializeAsAny
+
+from instrument.component import Component
+from instrument.model import Instrument
+from instrument.observe.observation import Observation
+from instrument.plan import Plan, make_plan
+from instrument.sky.base import Sky
+
+
+class Scene(Component):
+    """What is observed, with what, and when. `plan()` says what would be done; nothing is computed before `plan.run()`."""
+
+    name: str = "scene"
+    instrument: SerializeAsAny[Instrument]
+    sky: SerializeAsAny[Sky]
+    observation: Observation
+
+    def plan(self, tolerance: float = 0.0, engine: str | None = None, memory: Any = None) -> Plan:
+        """What is kept, what is left out and why, by which engine, at what cost and error bound.
+
+        `tolerance` bounds the error that may be made, relative to the total flux of the sky (0: exact omissions only);
+        `engine` names one instead of the cheapest; `memory` ("8 GB") is the most the run may take, three quarters of
+        the machine by default. Raises `InputError` for impossible scenes and `RefusedError` when no engine or not
+        enough memory serves.
+        """
+        return make_plan(
+            self.name, self.instrument, self.sky, self.observation, tolerance=tolerance, engine=engine, memory=memory
+        )

@@ -1,0 +1,1 @@
+"""Shipped scenes, as TOML files."""

@@ -1,0 +1,1 @@
+"""Skies: point and Gaussian sources, generated fields, and readers of catalogues."""

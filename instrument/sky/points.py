@@ -1,0 +1,221 @@
+"""PointSky: point and Gaussian sources with four Stokes parameters, spectra and rotation measures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Annotated, Any, Self
+
+import numpy as np
+from pydantic import model_validator
+
+from instrument.errors import InputError
+from instrument.jones.mueller import brightness
+from instrument.observe.directions import LIGHT, separation, tangents
+from instrument.observe.sampling import Sampling
+from instrument.sky.base import Sky
+from instrument.units import ArrayOf, Complex, Direction, Float, Int, unit_vectors
+
+Column = Annotated[Any, ArrayOf(float, (None,))]
+Flags = Annotated[Any, ArrayOf(bool, (None,))]
+Rows = Annotated[Any, ArrayOf(float, (None, None))]
+
+FWHM_TO_SIGMA = 1.0 / (2.0 * np.sqrt(2.0 * np.log(2.0)))
+PER_SOURCE = (
+    "ra_rad", "dec_rad", "stokes_jy", "reference_hz", "spectral_terms", "logarithmic", "rotation_measure",
+    "major_rad", "minor_rad", "angle_rad",
+)  # fmt: skip
+
+
+class PointSky(Sky):
+    """S sources: Stokes I, Q, U, V (S, 4) in Jy at `reference_hz`, with spectra, rotation measures and Gaussian shapes.
+
+    Stokes I: with logarithmic terms `I0 (f/f0)^(c0 + c1 x + c2 x^2 ...)`, x = log10(f/f0); with linear ones
+    `I0 + c0 y + c1 y^2 ...`, y = f/f0 - 1. Stokes Q and U turn with `rotation_measure` (rad/m^2), taken as valid at
+    the reference frequency: Q + iU = (Q0 + iU0) exp(2i RM (lambda^2 - lambda0^2)); where `polarization_follows_i` they
+    also carry the spectrum of I (as fractional polarization does). Without either, Q, U and V are constant.
+    Shapes: elliptical Gaussians, full width at half maximum `major_rad` along `angle_rad` (north through east at the
+    source) and `minor_rad` across it; zero is a point. `patches` names the group of a source ("" for none).
+    """
+
+    names: tuple[str, ...]
+    patches: tuple[str, ...] = ()
+    ra_rad: Column
+    dec_rad: Column
+    stokes_jy: Rows
+    reference_hz: Column | None = None
+    spectral_terms: Rows | None = None
+    logarithmic: Flags | None = None
+    rotation_measure: Column | None = None
+    polarization_follows_i: Flags | None = None
+    major_rad: Column | None = None
+    minor_rad: Column | None = None
+    angle_rad: Column | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        count = len(self.names)
+        if count == 0:
+            raise InputError("the sky is empty: it needs at least one source")
+        if self.patches and len(self.patches) != count:
+            raise InputError(f"{count} sources but {len(self.patches)} patches")
+        for field in (*PER_SOURCE, "polarization_follows_i"):
+            value = getattr(self, field)
+            if value is None:
+                continue
+            if len(value) != count:
+                raise InputError(f"{count} sources but {len(value)} entries of {field}")
+            bad = ~np.isfinite(value).reshape(count, -1).all(axis=1)
+            if bad.any():
+                raise InputError(f"{field} of source '{self.names[int(np.argmax(bad))]}' is not finite")
+        if self.stokes_jy.shape[1] != 4:
+            raise InputError(f"stokes_jy has shape {self.stokes_jy.shape}, needed (sources, 4)")
+        if np.any(np.abs(self.dec_rad) > np.pi / 2 + 1e-12):
+            raise InputError("a declination lies beyond the pole")
+        if self.reference_hz is None and (self.spectral_terms is not None or self.rotation_measure is not None):
+            raise InputError("spectral terms and rotation measures need reference_hz")
+        if self.reference_hz is not None and np.any(self.reference_hz <= 0):
+            raise InputError("reference_hz must be positive")
+        for field in ("major_rad", "minor_rad"):
+            value = getattr(self, field)
+            if value is not None and np.any(value < 0):
+                raise InputError(f"{field} of source '{self.names[int(np.argmin(value))]}' is negative")
+        return self
+
+    @classmethod
+    def read(cls, path: Any) -> PointSky:
+        """Sources of a file: BBS/makesourcedb text, or a CSV, ECSV, FITS or VOTable table with named columns."""
+        from instrument.sky.readers import read
+
+        return read(path)
+
+    @classmethod
+    def at(
+        cls, directions: Any, stokes_jy: Any, frequency: Any = None, names: Sequence[str] | None = None, **fields: Any
+    ) -> PointSky:
+        """Sources at a SkyCoord (S,) with Stokes parameters (S, 4), or Stokes I alone (S,), in Jy."""
+        from instrument.units import to_si
+
+        icrs = directions.icrs
+        ra, dec = np.atleast_1d(icrs.ra.rad).ravel(), np.atleast_1d(icrs.dec.rad).ravel()
+        flux = np.asarray(stokes_jy, float)
+        if flux.ndim < 2 and not (flux.ndim == 1 and len(ra) == 1 and flux.size == 4):
+            flux = np.atleast_1d(flux)[:, None] * np.array([1.0, 0.0, 0.0, 0.0])
+        flux = np.broadcast_to(np.atleast_2d(flux), (len(ra), 4))
+        reference = None if frequency is None else np.full(len(ra), to_si(frequency, "Hz", "frequency"))
+        given = tuple(names) if names is not None else tuple(f"s{i}" for i in range(len(ra)))
+        return cls(names=given, ra_rad=ra, dec_rad=dec, stokes_jy=flux, reference_hz=reference, **fields)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def sources(self) -> PointSky:
+        """Itself."""
+        return self
+
+    def select(self, rows: Int | Sequence[int]) -> PointSky:
+        """The sources of some rows, in that order."""
+        rows = np.asarray(rows, int)
+        changed: dict[str, Any] = {"names": tuple(self.names[i] for i in rows)}
+        if self.patches:
+            changed["patches"] = tuple(self.patches[i] for i in rows)
+        for field in (*PER_SOURCE, "polarization_follows_i"):
+            value = getattr(self, field)
+            if value is not None:
+                changed[field] = value[rows]
+        return self.with_fields(**changed)
+
+    def brightest(self, count: int) -> PointSky:
+        """The `count` sources of largest |I| + P, in their own order."""
+        if count < 1:
+            raise InputError(f"brightest = {count} sources: at least one is needed")
+        s = self.stokes_jy
+        power = np.abs(s[:, 0]) + np.sqrt((s[:, 1:] ** 2).sum(axis=1))
+        return self.select(np.sort(np.argsort(-power, kind="stable")[:count]))
+
+    def directions(self) -> tuple[Float, Float]:
+        """ICRS right ascension and declination, rad (S,)."""
+        return self.ra_rad, self.dec_rad
+
+    @cached_property
+    def vectors(self) -> Float:
+        """ICRS unit vectors (S, 3)."""
+        return unit_vectors(self.ra_rad, self.dec_rad)
+
+    def distance_rad(self, centre: Direction) -> Float:
+        """Angle from a direction, rad (S,)."""
+        return separation(self.vectors, centre)
+
+    @cached_property
+    def gaussian(self) -> Any:
+        """Which sources have a shape, bool (S,)."""
+        if self.major_rad is None or self.minor_rad is None:
+            return np.zeros(len(self), bool)
+        return (self.major_rad > 0) | (self.minor_rad > 0)
+
+    def stokes(self, freq_hz: Float) -> Float:
+        """Stokes parameters in Jy at some frequencies, (F, S, 4)."""
+        freq_hz = np.atleast_1d(freq_hz)
+        out = np.repeat(self.stokes_jy[None], len(freq_hz), axis=0)
+        if self.reference_hz is None:
+            return out
+        ratio = freq_hz[:, None] / self.reference_hz
+        if self.spectral_terms is not None:
+            factor, added = self._spectrum(ratio)
+            out[..., 0] = out[..., 0] * factor + added
+            if self.polarization_follows_i is not None:
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    relative = np.where(self.stokes_jy[:, 0] != 0, out[..., 0] / self.stokes_jy[:, 0], factor)
+                out[..., 1:] *= np.where(self.polarization_follows_i, relative, 1.0)[..., None]
+        if self.rotation_measure is not None:
+            turn = 2 * self.rotation_measure * ((LIGHT / freq_hz[:, None]) ** 2 - (LIGHT / self.reference_hz) ** 2)
+            linear = (out[..., 1] + 1j * out[..., 2]) * np.exp(1j * turn)
+            out[..., 1], out[..., 2] = linear.real, linear.imag
+        return out
+
+    def _spectrum(self, ratio: Float) -> tuple[Float, Float]:
+        """Factor and summand of Stokes I, (F, S), of its logarithmic and linear spectral terms."""
+        terms = np.asarray(self.spectral_terms)
+        log = np.ones(len(self), bool) if self.logarithmic is None else self.logarithmic
+        x, y = np.log10(ratio), ratio - 1.0
+        exponent, added = np.zeros_like(ratio), np.zeros_like(ratio)
+        for k in range(terms.shape[1]):
+            exponent += terms[:, k] * x**k
+            added += terms[:, k] * y ** (k + 1)
+        return np.where(log, ratio**exponent, 1.0), np.where(log, 0.0, added)
+
+    def brightness(self, at: Sampling) -> Complex:
+        """Brightness matrices (1, F, S, 2, 2)."""
+        return brightness(self.stokes(at.freq_hz))[None]
+
+    def envelope(self, at: Sampling, uvw_lambda: Float) -> Float | None:
+        """exp(-2 pi^2 (sigma_a^2 u'^2 + sigma_b^2 v'^2)) of each Gaussian, (T, F, B, S); `None` when all are points.
+
+        u', v' are the baseline along and across the major axis on the tangent plane at the source, so the position
+        angle counts from the source's own north.
+        """
+        if not self.gaussian.any():
+            return None
+        planes = self.shape_axes(at.centre)
+        along = np.einsum("tfbc,skc->ktfbs", uvw_lambda, planes)
+        return np.asarray(np.exp(-2 * np.pi**2 * (along[0] ** 2 + along[1] ** 2)))
+
+    def shape_axes(self, centre: Direction) -> Float:
+        """Major and minor sigma in rad times their unit vectors, in the u, v, w axes of a centre, (S, 2, 3)."""
+        out = np.zeros((len(self), 2, 3))
+        if not self.gaussian.any():
+            return out
+        angle = np.zeros(len(self)) if self.angle_rad is None else self.angle_rad
+        east, north = tangents(self.ra_rad, self.dec_rad)
+        major = np.cos(angle)[:, None] * north + np.sin(angle)[:, None] * east
+        minor = -np.sin(angle)[:, None] * north + np.cos(angle)[:, None] * east
+        e0, n0 = tangents(np.array([centre.ra_rad]), np.array([centre.dec_rad]))
+        axes = np.stack([e0[0], n0[0], centre.vector])
+        out[:, 0] = FWHM_TO_SIGMA * self.major_rad[:, None] * (major @ axes.T)
+        out[:, 1] = FWHM_TO_SIGMA * self.minor_rad[:, None] * (minor @ axes.T)
+        return out
+
+    def flux_kinds(self, freq_hz: Float) -> tuple[bool, bool, bool, bool]:
+        """Which of I, Q, U, V differ from zero in any source and channel."""
+        found = np.any(self.stokes(freq_hz) != 0, axis=(0, 1))
+        return tuple(bool(x) for x in found)  # type: ignore[return-value]

@@ -1,0 +1,203 @@
+"""Unit-aware fields of components: a unit at the door, plain SI numbers inside.
+
+`Metres`, `Seconds`, `Hertz`, `Radians`, `Jansky`, ... annotate a field of a `Component`. They accept an astropy
+`Quantity` or a string such as "30.8 m", store a float in the SI unit of the name (Jansky stays Jy, as the field does)
+and go to JSON as a string with the unit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, GetCoreSchemaHandler, PlainSerializer, ValidationInfo
+from pydantic_core import core_schema
+
+from instrument.errors import InputError, UnitError
+
+Complex = NDArray[np.complexfloating[Any, Any]]
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+
+
+def to_si(value: object, unit: str, name: str = "the value") -> Any:
+    """Value of a `Quantity` or of a string with a unit, as float(s) in `unit`; raises `UnitError` for a bare number."""
+    from astropy import units as u
+
+    wanted = u.Unit(unit)
+    if isinstance(value, str):
+        try:
+            value = u.Quantity(value)
+        except (TypeError, ValueError) as error:
+            raise UnitError(f"{name} = '{value}' is not a number with a unit convertible to {unit}") from error
+    elif isinstance(value, list | tuple) and value and all(isinstance(v, str | u.Quantity) for v in value):
+        return np.array([to_si(v, unit, name) for v in value], float)
+    if not isinstance(value, u.Quantity):
+        raise UnitError(f"{name} needs a unit convertible to {unit}, got the bare {value!r}; write it with its unit")
+    try:
+        number = value.to_value(wanted)
+    except u.UnitConversionError as error:
+        raise UnitError(f"{name} needs a unit convertible to {unit}, got '{value}'") from error
+    return float(number) if np.ndim(number) == 0 else np.asarray(number, float)
+
+
+@dataclass(frozen=True)
+class In:
+    """Marks a field: the unit it is stored in, and whether it is an array (one axis)."""
+
+    unit: str
+    array: bool = False
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        def check(value: object, info: core_schema.ValidationInfo) -> Any:
+            number = to_si(value, self.unit, info.field_name or "the value")
+            if not np.all(np.isfinite(number)):
+                raise InputError(f"{info.field_name} is not finite")
+            if not self.array and np.ndim(number):
+                raise InputError(f"{info.field_name} takes one value, got {np.shape(number)}")
+            if self.array:
+                number = np.array(np.atleast_1d(number), float)
+                if number.ndim != 1:
+                    raise InputError(f"{info.field_name} takes a list of values, got {np.shape(number)}")
+                number.setflags(write=False)
+            return number
+
+        def write(value: Any) -> Any:
+            return [f"{v!r} {self.unit}" for v in value.tolist()] if self.array else f"{value!r} {self.unit}"
+
+        return core_schema.with_info_plain_validator_function(
+            check,
+            serialization=core_schema.plain_serializer_function_ser_schema(write, when_used="json"),
+        )
+
+
+Metres = Annotated[float, In("m")]
+Seconds = Annotated[float, In("s")]
+Hertz = Annotated[float, In("Hz")]
+HertzArray = Annotated[Float, In("Hz", array=True)]
+Radians = Annotated[float, In("rad")]
+Jansky = Annotated[float, In("Jy")]
+Bytes = Annotated[float, In("byte")]
+
+
+@dataclass(frozen=True)
+class ArrayOf:
+    """Marks a read-only array field: dtype and shape, `None` for a free axis."""
+
+    dtype: type
+    shape: tuple[int | None, ...]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        def check(value: object, info: core_schema.ValidationInfo) -> Any:
+            if isinstance(value, dict) and {"real", "imag"} <= set(value):
+                value = np.array(value["real"], float) + 1j * np.array(value["imag"], float)
+            array = np.array(value, dtype=self.dtype)
+            fits = array.ndim == len(self.shape) and all(
+                n in (None, m) for n, m in zip(self.shape, array.shape, strict=True)
+            )
+            if not fits:
+                want = "(" + ", ".join("any" if n is None else str(n) for n in self.shape) + ")"
+                raise InputError(f"{info.field_name} has shape {array.shape}, needed {want}")
+            array.setflags(write=False)
+            return array
+
+        def write(value: Any) -> Any:
+            if np.iscomplexobj(value):
+                return {"real": value.real.tolist(), "imag": value.imag.tolist()}
+            return value.tolist()
+
+        return core_schema.with_info_plain_validator_function(
+            check,
+            serialization=core_schema.plain_serializer_function_ser_schema(write, when_used="json"),
+        )
+
+
+class Direction(NamedTuple):
+    """A direction on the sky: ICRS right ascension and declination in rad."""
+
+    ra_rad: float
+    dec_rad: float
+
+    @property
+    def vector(self) -> Float:
+        """Unit vector, ICRS, (3,)."""
+        return unit_vectors(np.array([self.ra_rad]), np.array([self.dec_rad]))[0]
+
+    @property
+    def skycoord(self) -> Any:
+        """The same as an astropy `SkyCoord`."""
+        from astropy.coordinates import SkyCoord
+
+        return SkyCoord(self.ra_rad, self.dec_rad, unit="rad", frame="icrs")
+
+    def __str__(self) -> str:
+        return str(self.skycoord.to_string("hmsdms", precision=3))
+
+
+def unit_vectors(ra_rad: Float, dec_rad: Float) -> Float:
+    """Unit vectors (S, 3) of right ascensions and declinations (S,)."""
+    return np.stack([np.cos(dec_rad) * np.cos(ra_rad), np.cos(dec_rad) * np.sin(ra_rad), np.sin(dec_rad)], axis=-1)
+
+
+def _direction(value: object, info: ValidationInfo) -> Direction:
+    if isinstance(value, Direction):
+        return value
+    from astropy.coordinates import SkyCoord
+
+    name = info.field_name
+    try:
+        coord = SkyCoord(value) if isinstance(value, str) else value
+    except ValueError as error:
+        raise InputError(f"{name} = '{value}' is not a direction; write it like '08h13m36.0s +48d13m03s'") from error
+    if not isinstance(coord, SkyCoord) or coord.size != 1:
+        raise InputError(f"{name} = {value!r} is not one direction; give a SkyCoord or '08h13m36.0s +48d13m03s'")
+    icrs = coord.icrs
+    found = Direction(float(np.squeeze(icrs.ra.rad)), float(np.squeeze(icrs.dec.rad)))
+    if not np.all(np.isfinite(found)):
+        raise InputError(f"{name} is not finite")
+    return found
+
+
+def _write_direction(value: Direction | None) -> str | None:
+    return value and f"{value.ra_rad!r}rad {value.dec_rad!r}rad"
+
+
+SkyDirection = Annotated[
+    Direction, BeforeValidator(_direction), PlainSerializer(_write_direction, return_type=str, when_used="json")
+]
+
+
+def _instant(value: object, info: ValidationInfo) -> Any:
+    from astropy.time import Time
+
+    try:
+        time = Time(value, scale="utc") if isinstance(value, str) else value
+    except ValueError as error:
+        raise InputError(f"{info.field_name} = '{value}' is not a UTC time; write it like '2012-12-07T23:00:00'") from (
+            error
+        )
+    if not isinstance(time, Time) or not time.isscalar:
+        raise InputError(f"{info.field_name} = {value!r} is not one time; give a Time or '2012-12-07T23:00:00'")
+    return time.utc
+
+
+def _write_instant(value: Any) -> str:
+    exact = value.utc.copy(format="isot")
+    exact.precision = 9
+    return str(exact.value)
+
+
+Instant = Annotated[Any, BeforeValidator(_instant), PlainSerializer(_write_instant, return_type=str, when_used="json")]
+
+
+def si_prefix(value: float, unit: str) -> str:
+    """Three digits with a metric prefix: `7.2e10, 'Flop'` -> `72 GFlop`."""
+    if not np.isfinite(value) or value == 0:
+        return f"{value:.3g} {unit}"
+    for factor, prefix in ((1e15, "P"), (1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if abs(value) >= factor:
+            return f"{value / factor:.3g} {prefix}{unit}"
+    return f"{value:.3g} {unit}"

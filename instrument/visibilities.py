@@ -1,0 +1,198 @@
+"""Visibilities: data of all baselines with their coordinates, weights, flags, and which beam has been taken out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+
+from instrument import mat2
+from instrument.errors import BeamStateError, InputError
+from instrument.jones import mueller
+from instrument.jones.base import JonesTerm
+from instrument.jones.chain import Chain
+from instrument.jones.gain import slot_normals
+from instrument.jones.towards import Towards
+from instrument.observe.layout import Layout
+from instrument.observe.sampling import Sampling
+from instrument.units import Bool, Complex, Direction, Float, Int, to_si
+
+
+@dataclass(frozen=True)
+class BeamState:
+    """What has been taken out of visibilities, and towards where: "nothing" (absolute beam) or "centre" (differential)."""
+
+    removed: Literal["nothing", "centre"] = "nothing"
+    towards: Direction | None = None
+
+    def __str__(self) -> str:
+        return "absolute beam" if self.removed == "nothing" else f"differential beam, removed towards {self.towards}"
+
+
+def _ones() -> Float:
+    return np.ones((1, 1, 1))
+
+
+def _no_flags() -> Bool:
+    return np.zeros((1, 1, 1), bool)
+
+
+@dataclass(frozen=True, eq=False)
+class Visibilities:
+    """Visibilities in Jy, complex (T, F, B, 2, 2): rows are receptors p, q of the first station, columns of the second.
+
+    `at` holds times, channels, stations and the phase centre; `weight` and `flag` are (T, F, B), length 1 where
+    constant. Nothing is changed in place: every method returns a new object.
+    """
+
+    data: Complex
+    at: Sampling
+    antenna1: Int
+    antenna2: Int
+    interval_s: float
+    width_hz: float | None = None
+    weight: Float = field(default_factory=_ones)
+    flag: Bool = field(default_factory=_no_flags)
+    beam_state: BeamState = BeamState()
+
+    def __post_init__(self) -> None:
+        times, channels, _, _ = self.at.shape
+        want = (times, channels, len(self.antenna1), 2, 2)
+        if self.data.shape != want:
+            raise InputError(f"data has shape {self.data.shape}, the coordinates need {want}")
+        for name in ("weight", "flag"):
+            shape = getattr(self, name).shape
+            if len(shape) != 3 or any(n not in (1, m) for n, m in zip(shape, want, strict=False)):
+                raise InputError(f"{name} has shape {shape}, needed {want[:3]} with length 1 where constant")
+
+    @property
+    def layout(self) -> Layout:
+        """The stations."""
+        return self.at.layout
+
+    @property
+    def phase_centre(self) -> Direction:
+        """Where the fringes are stopped."""
+        return self.at.centre
+
+    @property
+    def freq_hz(self) -> Float:
+        """Channel centres, Hz (F,)."""
+        return self.at.freq_hz
+
+    @property
+    def times(self) -> Any:
+        """Centres of the integrations, UTC `Time` (T,)."""
+        from astropy.time import Time
+
+        return Time(self.at.slots_s // 86400, (self.at.slots_s % 86400) / 86400, format="mjd", scale="utc")
+
+    @cached_property
+    def uvw_m(self) -> Float:
+        """Baselines u, v, w in m (T, B, 3): station 1 minus station 2."""
+        stations = self.at.uvw_m
+        return stations[:, self.antenna1] - stations[:, self.antenna2]
+
+    @property
+    def effective_weight(self) -> Float:
+        """Weights with flagged and non-finite data at zero, (T, F, B)."""
+        good = (
+            ~self.flag & np.isfinite(self.data.real).all(axis=(-2, -1)) & np.isfinite(self.data.imag).all(axis=(-2, -1))
+        )
+        return np.where(good, self.weight, 0.0)
+
+    def with_data(self, data: Complex) -> Visibilities:
+        """The same coordinates with other data, (T, F, B, 2, 2)."""
+        return replace(self, data=np.asarray(data))
+
+    def flagged(self, flag: Bool) -> Visibilities:
+        """The same with more flags, (T, F, B), length 1 where constant."""
+        return replace(self, flag=self.flag | np.asarray(flag, bool))
+
+    def weighted(self, weight: Float) -> Visibilities:
+        """The same with other weights (T, F, B), length 1 where constant; negative and non-finite ones raise."""
+        weight = np.asarray(weight, float)
+        if not np.all(np.isfinite(weight)) or np.any(weight < 0):
+            raise InputError("weights must be finite and not negative")
+        return replace(self, weight=weight)
+
+    def stokes(self) -> Complex:
+        """Stokes visibilities I, Q, U, V in Jy, complex (T, F, B, 4): I = (pp+qq)/2 and so on."""
+        return mueller.stokes(self.data)
+
+    def noise_jy(self, sefd: Any) -> float:
+        """Rms of the noise in the real or imaginary part of one correlation: SEFD / sqrt(2 dnu dt), in Jy."""
+        if self.width_hz is None:
+            raise InputError("noise needs the width of a channel: give channel_width to the Observation")
+        value = float(to_si(sefd, "Jy", "sefd"))
+        if not (np.isfinite(value) and value >= 0):
+            raise InputError(f"sefd = {value} Jy must be finite and not negative")
+        return value / np.sqrt(2 * self.width_hz * self.interval_s)
+
+    def with_noise(self, sefd: Any, seed: int) -> Visibilities:
+        """The same with thermal noise of stations of one system equivalent flux density added.
+
+        The noise of an integration and channel depends on seed, time and frequency only, not on the blocks of a run.
+        """
+        sigma = self.noise_jy(sefd)
+        noisy = np.array(self.data)
+        count = len(self.antenna1)
+        for i, freq in enumerate(self.freq_hz):
+            # slot_normals has unit power over both parts, so each part has 1/2
+            noisy[:, i] += np.sqrt(2) * sigma * slot_normals((seed, round(freq)), self.at.slots_s, (count, 2, 2))
+        return replace(self, data=noisy)
+
+    def corrected(self, term: JonesTerm | Chain) -> Visibilities:
+        """J_a^-1 V J_b^-H for a direction-independent term; visibilities of singular Jones matrices are flagged and zero."""
+        jones = self._station_jones(term)
+        inverse = mat2.inverse(jones)
+        good = np.isfinite(inverse).all(axis=(-2, -1))
+        inverse = np.where(good[..., None, None], inverse, 0.0)
+        data = mat2.sandwich(inverse[:, :, self._pick(inverse, 1)], self.data, inverse[:, :, self._pick(inverse, 2)])
+        flag = self.flag | ~(good[:, :, self._pick(inverse, 1)] & good[:, :, self._pick(inverse, 2)])
+        state = self.beam_state
+        if isinstance(term, Towards):
+            if state.removed != "nothing":
+                raise BeamStateError(
+                    f"a beam has been taken out already ({state}): start from uncorrected visibilities"
+                )
+            state = BeamState("centre", term.direction or self.phase_centre)
+        return replace(self, data=data, flag=flag, beam_state=state)
+
+    def corrupted(self, term: JonesTerm | Chain) -> Visibilities:
+        """J_a V J_b^H for a direction-independent term; inverse of `corrected`."""
+        jones = self._station_jones(term)
+        data = mat2.sandwich(jones[:, :, self._pick(jones, 1)], self.data, jones[:, :, self._pick(jones, 2)])
+        return replace(self, data=data)
+
+    def __sub__(self, other: Visibilities) -> Visibilities:
+        """Difference of two sets on the same coordinates; raises `BeamStateError` when their beam states differ."""
+        if self.beam_state != other.beam_state:
+            raise BeamStateError(f"cannot mix visibilities of {self.beam_state} and of {other.beam_state}")
+        same = (
+            self.data.shape == other.data.shape
+            and np.array_equal(self.antenna1, other.antenna1)
+            and np.array_equal(self.antenna2, other.antenna2)
+            and np.array_equal(self.at.slots_s, other.at.slots_s)
+            and np.array_equal(self.freq_hz, other.freq_hz)
+        )
+        if not same:
+            raise InputError("visibilities with different times, channels or baselines cannot be subtracted")
+        return replace(self, data=self.data - other.data, flag=self.flag | other.flag)
+
+    def _station_jones(self, term: JonesTerm | Chain) -> Complex:
+        found = term.jones(self.at)[:, :, :, :1]
+        spread = [t for t in (term.parts if isinstance(term, Chain) else term.parts()) if t.directional]
+        if spread:
+            raise InputError(
+                f"{type(spread[0]).__name__} differs between directions: visibilities can be corrected towards one "
+                "direction only; use Towards(chain=...)"
+            )
+        return found[:, :, :, 0]
+
+    def _pick(self, jones: Complex, which: int) -> Any:
+        if jones.shape[2] == 1:
+            return slice(None)
+        return self.antenna1 if which == 1 else self.antenna2

@@ -1,0 +1,1 @@
+"""Plugins of `instrument`: element beams, telescopes and foreground removers, found through entry points."""

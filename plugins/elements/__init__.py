@@ -1,0 +1,1 @@
+"""Element beams: the pattern of one antenna."""

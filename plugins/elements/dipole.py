@@ -1,0 +1,38 @@
+"""CrossedDipole: two short dipoles at right angles over an infinite ground plane."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from instrument.jones.base import ElementBeam
+from instrument.mat2 import pack
+from instrument.observe.directions import LIGHT
+from instrument.observe.sampling import Sampling
+from instrument.units import Complex, Metres, Radians
+
+
+class CrossedDipole(ElementBeam):
+    """Ideal crossed dipoles `height` above a perfect ground plane, (T, F, A, S, 2, 2).
+
+    J = sin(2 pi h/lambda cos theta) [[cos theta cos a, -sin a], [cos theta sin a, cos a]], a = azimuth - azimuth of X; the
+    second row is that of the Y dipole, 90 deg further from p (east) to q (north). 1 at the zenith for h = lambda/4.
+    Closed form of image theory (for example Balanis, Antenna Theory, chapter 4). Zero below the plane.
+    """
+
+    height: Annotated[Metres, Field(gt=0)]
+    x_azimuth: Radians = 0.0
+
+    def jones(self, at: Sampling) -> Complex:
+        """J of the element, (T, F, A, S, 2, 2)."""
+        theta = at.zenith_angle
+        cos_az, sin_az = at.azimuth_cos_sin
+        c, s = np.cos(self.x_azimuth), np.sin(self.x_azimuth)
+        cos_a, sin_a = cos_az * c + sin_az * s, sin_az * c - cos_az * s
+        cos_theta = np.where(theta < np.pi / 2, np.cos(theta), 0.0)
+        height = 2 * np.pi * self.height * at.freq_hz / LIGHT
+        plane = np.sin(height[:, None, None] * cos_theta[:, None])
+        field = pack(cos_theta * cos_a, -sin_a, cos_theta * sin_a, cos_a)
+        return plane[..., None, None] * field[:, None]

@@ -1,0 +1,1 @@
+"""Telescopes: layouts and chains of real arrays."""
