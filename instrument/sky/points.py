@@ -21,10 +21,11 @@ Flags = Annotated[Any, ArrayOf(bool, (None,))]
 Rows = Annotated[Any, ArrayOf(float, (None, None))]
 
 FWHM_TO_SIGMA = 1.0 / (2.0 * np.sqrt(2.0 * np.log(2.0)))
-PER_SOURCE = (
-    "ra_rad", "dec_rad", "stokes_jy", "reference_hz", "spectral_terms", "logarithmic", "rotation_measure",
-    "major_rad", "minor_rad", "angle_rad",
+OPTIONAL = (
+    "reference_hz", "spectral_terms", "logarithmic", "rotation_measure", "polarization_follows_i", "major_rad",
+    "minor_rad", "angle_rad",
 )  # fmt: skip
+PER_SOURCE = ("ra_rad", "dec_rad", "stokes_jy", *OPTIONAL)
 
 
 class PointSky(Sky):
@@ -32,10 +33,11 @@ class PointSky(Sky):
 
     Stokes I: with logarithmic terms `I0 (f/f0)^(c0 + c1 x + c2 x^2 ...)`, x = log10(f/f0); with linear ones
     `I0 + c0 y + c1 y^2 ...`, y = f/f0 - 1. Stokes Q and U turn with `rotation_measure` (rad/m^2), taken as valid at
-    the reference frequency: Q + iU = (Q0 + iU0) exp(2i RM (lambda^2 - lambda0^2)); where `polarization_follows_i` they
-    also carry the spectrum of I (as fractional polarization does). Without either, Q, U and V are constant.
+    the reference frequency: Q + iU = (Q0 + iU0) exp(2i RM (lambda^2 - lambda0^2)); where `polarization_follows_i`, Q, U
+    and V also carry the spectrum of I (as fractional polarization does). Without either, Q, U and V are constant.
     Shapes: elliptical Gaussians, full width at half maximum `major_rad` along `angle_rad` (north through east at the
-    source) and `minor_rad` across it; zero is a point. `patches` names the group of a source ("" for none).
+    source) and `minor_rad` across it, either of them the longer; both zero is a point. `patches` names the group of a
+    source ("" for none).
     """
 
     names: tuple[str, ...]
@@ -59,7 +61,7 @@ class PointSky(Sky):
             raise InputError("the sky is empty: it needs at least one source")
         if self.patches and len(self.patches) != count:
             raise InputError(f"{count} sources but {len(self.patches)} patches")
-        for field in (*PER_SOURCE, "polarization_follows_i"):
+        for field in PER_SOURCE:
             value = getattr(self, field)
             if value is None:
                 continue
@@ -80,14 +82,47 @@ class PointSky(Sky):
             value = getattr(self, field)
             if value is not None and np.any(value < 0):
                 raise InputError(f"{field} of source '{self.names[int(np.argmin(value))]}' is negative")
+        if (self.major_rad is None) != (self.minor_rad is None):
+            raise InputError("major_rad and minor_rad come together: one of them is missing")
+        if self.angle_rad is None and self.major_rad is not None and np.any(self.major_rad != self.minor_rad):
+            raise InputError("angle_rad is missing: an ellipse needs the position angle of its first axis")
         return self
 
     @classmethod
-    def read(cls, path: Any) -> PointSky:
-        """Sources of a file: BBS/makesourcedb text, or a CSV, ECSV, FITS or VOTable table with named columns."""
+    def read(cls, path: Any, centre: Any = None) -> PointSky:
+        """Sources of a file: BBS/makesourcedb text, or a CSV, ECSV, FITS or VOTable table with named columns.
+
+        `centre` is the phase centre of the model, from which BBS files count orientations; see `readers.read`.
+        """
         from instrument.sky.readers import read
 
-        return read(path)
+        return read(path, centre)
+
+    @classmethod
+    def join(cls, *skies: PointSky) -> PointSky:
+        """The sources of several skies, one after the other; what one of them lacks is filled with 'no effect'."""
+        known = [s.reference_hz for s in skies if s.reference_hz is not None]
+        width = max(0 if s.spectral_terms is None else s.spectral_terms.shape[1] for s in skies)
+        # a sky without reference_hz is constant in frequency: any reference does for it
+        neutral = {"reference_hz": known[0][0] if known else None, "logarithmic": True}
+        fields: dict[str, Any] = {"names": sum((s.names for s in skies), ())}
+        if any(s.patches for s in skies):
+            fields["patches"] = sum((s.patches or ("",) * len(s) for s in skies), ())
+        for field in OPTIONAL:
+            given = [getattr(s, field) for s in skies]
+            if all(g is None for g in given):
+                continue
+            if field == "spectral_terms":
+                none = [np.zeros((len(s), 0)) if g is None else g for s, g in zip(skies, given, strict=True)]
+                fields[field] = np.concatenate([np.pad(g, ((0, 0), (0, width - g.shape[1]))) for g in none])
+                continue
+            fill = neutral.get(field, 0)
+            fields[field] = np.concatenate(
+                [np.full(len(s), fill) if g is None else g for s, g in zip(skies, given, strict=True)]
+            )
+        for field in ("ra_rad", "dec_rad", "stokes_jy"):
+            fields[field] = np.concatenate([getattr(s, field) for s in skies])
+        return cls(**fields)
 
     @classmethod
     def at(
@@ -119,7 +154,7 @@ class PointSky(Sky):
         changed: dict[str, Any] = {"names": tuple(self.names[i] for i in rows)}
         if self.patches:
             changed["patches"] = tuple(self.patches[i] for i in rows)
-        for field in (*PER_SOURCE, "polarization_follows_i"):
+        for field in PER_SOURCE:
             value = getattr(self, field)
             if value is not None:
                 changed[field] = value[rows]

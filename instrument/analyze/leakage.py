@@ -1,0 +1,165 @@
+"""Leakage: how much of Stokes I of each source is seen as linear and circular polarization."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from instrument import mat2
+from instrument.analyze.photometry import SourceFluxes
+from instrument.jones.chain import Chain
+from instrument.jones.mueller import TO_LINEAR, TO_STOKES
+from instrument.observe.directions import separation
+from instrument.observe.sampling import Sampling
+from instrument.units import Bool, Complex, Direction, Float, unit_vectors
+
+NULL = 0.01  # apparent over true flux below which a source lies near a null of the beam
+
+
+@dataclass(frozen=True)
+class Leakage:
+    """Leakage of every source, one channel: fluxes (G, 4) in Jy, leakages in % of its apparent I (G,).
+
+    `near_null` marks sources whose apparent flux is below 1 % of the true one: their leakage is a ratio of two small
+    numbers and says little about the instrument. `expected` holds the same leakages (G, 2) from the beam model (the
+    mean Mueller matrix over baselines and times), where it was asked for.
+    """
+
+    names: tuple[str, ...]
+    ra_rad: Float
+    dec_rad: Float
+    distance_rad: Float
+    model_jy: Float
+    stokes_jy: Float
+    freq_hz: float
+    near_null: Bool
+    expected: Float | None = None
+
+    @property
+    def linear_percent(self) -> Float:
+        """sqrt(Q2 + U2) / |I|, % (G,)."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return 100 * np.hypot(self.stokes_jy[:, 1], self.stokes_jy[:, 2]) / np.abs(self.stokes_jy[:, 0])
+
+    @property
+    def circular_percent(self) -> Float:
+        """|V| / |I|, % (G,)."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return 100 * np.abs(self.stokes_jy[:, 3]) / np.abs(self.stokes_jy[:, 0])
+
+    def table(self) -> Any:
+        """Everything as an astropy table, one row a source, with units."""
+        from astropy import units as u
+        from astropy.table import QTable
+
+        out = QTable()
+        out["name"] = list(self.names)
+        out["ra"] = np.rad2deg(self.ra_rad) * u.deg
+        out["dec"] = np.rad2deg(self.dec_rad) * u.deg
+        out["distance"] = np.rad2deg(self.distance_rad) * u.deg
+        for k, stokes in enumerate("IQUV"):
+            out[stokes] = self.stokes_jy[:, k] * u.Jy
+        out["I_model"] = self.model_jy[:, 0] * u.Jy
+        out["linear"] = self.linear_percent * u.percent
+        out["circular"] = self.circular_percent * u.percent
+        if self.expected is not None:
+            out["linear_expected"] = self.expected[:, 0] * u.percent
+            out["circular_expected"] = self.expected[:, 1] * u.percent
+        out["near_null"] = self.near_null
+        out.meta["frequency_hz"] = self.freq_hz
+        return out
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write the table as ECSV."""
+        target = Path(path)
+        partial = target.with_name(target.name + ".part")
+        self.table().write(str(partial), format="ascii.ecsv", overwrite=True)
+        partial.replace(target)
+
+    def rings(self, edges_deg: tuple[float, ...] = (0.1, 1, 2, 3, 4, 5)) -> list[dict[str, float]]:
+        """Median and maximum leakage in rings about the centre; the first row is what lies inside the first edge."""
+        distance = np.rad2deg(self.distance_rad)
+        rows = []
+        for low, high in zip((0.0, *edges_deg[:-1]), edges_deg, strict=True):
+            # a source at the very centre may be at 1e-15 deg
+            inside = (distance >= low) & (distance < high) & ~self.near_null
+            if not inside.any():
+                continue
+            linear, circular = self.linear_percent[inside], self.circular_percent[inside]
+            rows.append(
+                {
+                    "from_deg": low,
+                    "to_deg": high,
+                    "sources": int(inside.sum()),
+                    "linear_median": float(np.median(linear)),
+                    "linear_max": float(linear.max()),
+                    "circular_median": float(np.median(circular)),
+                    "circular_max": float(circular.max()),
+                }
+            )
+        return rows
+
+    def inside(self, radius_deg: float) -> dict[str, float]:
+        """Median and maximum leakages of the sources within a radius, those near a null left out."""
+        use = (np.rad2deg(self.distance_rad) <= radius_deg) & ~self.near_null
+        linear, circular = self.linear_percent[use], self.circular_percent[use]
+        return {
+            "sources": int(use.sum()),
+            "linear_median": float(np.median(linear)) if use.any() else float("nan"),
+            "linear_max": float(linear.max()) if use.any() else float("nan"),
+            "circular_median": float(np.median(circular)) if use.any() else float("nan"),
+            "circular_max": float(circular.max()) if use.any() else float("nan"),
+        }
+
+
+def leakage_of(fluxes: SourceFluxes, centre: Direction, channel: int = 0, expected: Float | None = None) -> Leakage:
+    """Leakage of measured fluxes in one channel, about a centre."""
+    measured, model = fluxes.stokes_jy[channel], fluxes.model_jy[channel]
+    with np.errstate(invalid="ignore"):
+        null = ~(np.abs(measured[:, 0]) >= NULL * np.abs(model[:, 0]))
+    return Leakage(
+        names=fluxes.names,
+        ra_rad=fluxes.ra_rad,
+        dec_rad=fluxes.dec_rad,
+        distance_rad=separation(unit_vectors(fluxes.ra_rad, fluxes.dec_rad), centre),
+        model_jy=model,
+        stokes_jy=measured,
+        freq_hz=float(fluxes.freq_hz[channel]),
+        near_null=null | (model[:, 0] == 0),
+        expected=expected,
+    )
+
+
+def mean_mueller(chain: Chain, at: Sampling, differential: bool) -> Complex:
+    """Mueller matrix of each direction, the mean over all baselines a < b and the times of `at`, complex (F, S, 4, 4).
+
+    Both orders of a baseline are counted, so what is antisymmetric between stations cancels, as it does in an image.
+    """
+    times, channels, stations, sources = at.shape
+    centre = chain.jones(at.at_centre()) if differential else None
+    total = np.zeros((channels, sources, 4, 4), complex)
+    for t in range(times):
+        one = at.block(slice(t, t + 1), slice(None))
+        jones = np.broadcast_to(chain.jones(one), (1, channels, stations, sources, 2, 2))[0]
+        if centre is not None:
+            jones = mat2.mul(mat2.inverse(np.broadcast_to(centre, (times, channels, stations, 1, 2, 2))[t]), jones)
+        whole = jones.sum(axis=1)
+        total += _kron(whole, whole) - _kron(jones, jones).sum(axis=1)
+    return np.asarray(TO_STOKES @ (total / (times * stations * (stations - 1))) @ TO_LINEAR)
+
+
+def _kron(a: Complex, b: Complex) -> Complex:
+    return np.einsum("...ij,...kl->...ikjl", a, b.conj()).reshape(*a.shape[:-2], 4, 4)
+
+
+def expected_percent(
+    chain: Chain, at: Sampling, stokes_jy: Float, channel: int = 0, differential: bool = True
+) -> Float:
+    """Linear and circular polarization in % of I (S, 2) that sources of Stokes (S, 4) should show, from the beam model."""
+    seen = np.einsum("sij,sj->si", mean_mueller(chain, at, differential)[channel], stokes_jy).real
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return 100 * np.stack([np.hypot(seen[:, 1], seen[:, 2]), np.abs(seen[:, 3])], axis=1) / np.abs(seen[:, :1])

@@ -1,0 +1,193 @@
+"""Imager: dirty images of I, Q, U, V and the PSF, on ducc0's w-gridder, block by block."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from instrument.component import Component
+from instrument.errors import InputError, RefusedError
+from instrument.image.cube import Psf, StokesCube
+from instrument.image.psf import fit_psf
+from instrument.image.weights import Density, Weighting
+from instrument.observe.directions import LIGHT
+from instrument.units import Complex, Float, Radians
+from instrument.visibilities import Visibilities
+
+HELD = 1_000_000  # visibilities gridded at once: bounds memory (90 MB) and keeps the fixed cost of a call small
+
+
+class Imager(Component):
+    """Dirty images of `pixels` x `pixels` of `pixel` each, from baselines within `uv_range` (wavelengths).
+
+    `weighting` "natural", "uniform" or "briggs" (with `robust`). The w-term is always there. `accuracy` is that of the
+    gridding, relative to the rms of the image. Flagged and non-finite visibilities have no weight.
+    """
+
+    pixels: Annotated[int, Field(ge=16, le=32768)]
+    pixel: Annotated[Radians, Field(gt=0)]
+    uv_range: tuple[float, float] | None = None
+    weighting: Weighting = "natural"
+    robust: Annotated[float, Field(ge=-4, le=4)] = 0.0
+    accuracy: Annotated[float, Field(ge=1e-12, le=1e-2)] = 1e-6
+
+    @field_validator("pixels")
+    @classmethod
+    def _even(cls, value: int) -> int:
+        if value % 2:
+            raise InputError(f"pixels = {value} must be even: take {value + 1}")
+        return value
+
+    @field_validator("uv_range")
+    @classmethod
+    def _ordered(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
+        if value is not None and not 0 <= value[0] < value[1]:
+            raise InputError(f"uv_range = {value} must be two numbers of wavelengths, the smaller one first")
+        return value
+
+    def image(self, visibilities: Visibilities | Iterable[Visibilities]) -> StokesCube:
+        """Dirty images in Jy/beam (F, 4, N, N) with their PSF, of visibilities or of blocks of them.
+
+        Blocks must cover channels one after the other or all at once. Weights other than natural go over the blocks
+        twice, so an iterator that can be read only once is refused.
+        """
+        blocks = [visibilities] if isinstance(visibilities, Visibilities) else visibilities
+        density = None
+        if self.weighting != "natural":
+            if iter(blocks) is blocks:
+                raise InputError(f"{self.weighting} weights go over the visibilities twice: give a list of blocks")
+            density = self.density(blocks)
+        total = self.start(density)
+        for block in blocks:
+            total.add(block)
+        return total.finish()
+
+    def psf(self, visibilities: Visibilities | Iterable[Visibilities]) -> Psf:
+        """The point spread function alone, peak 1."""
+        found = self.image(visibilities).psf
+        assert found is not None
+        return found
+
+    def start(self, density: dict[float, Density] | None = None) -> Images:
+        """Sums to which blocks are added one by one; `density` is needed for weights other than natural."""
+        if (density is None) != (self.weighting == "natural"):
+            raise InputError(f"{self.weighting} weights {'take no' if density else 'need the'} density of the uv plane")
+        return Images(self, density)
+
+    def density(self, blocks: Iterable[Visibilities]) -> dict[float, Density]:
+        """Density of the uv plane in every channel (by frequency), for weights other than natural."""
+        found: dict[float, Density] = {}
+        for block in blocks:
+            for f, freq in enumerate(block.freq_hz):
+                uvw, weight, _ = self.chosen(block, f)
+                found.setdefault(float(freq), Density(self.pixels, self.pixel)).add(uvw[:, :2], weight)
+        return found
+
+    def chosen(self, block: Visibilities, channel: int) -> tuple[Float, Float, Any]:
+        """Baselines in wavelengths (N, 3) within the uv range, their weights (N,), and which ones (T, B) they are."""
+        uvw = block.uvw_m * (block.freq_hz[channel] / LIGHT)
+        weight = np.broadcast_to(block.effective_weight, block.data.shape[:3])[:, channel]
+        use = weight > 0
+        if self.uv_range is not None:
+            length = np.hypot(uvw[..., 0], uvw[..., 1])
+            use = use & (length >= self.uv_range[0]) & (length <= self.uv_range[1])
+        return uvw[use], weight[use], use
+
+
+class _Channel:
+    """Images of one channel: visibilities waiting to be gridded, and what has been."""
+
+    def __init__(self, freq_hz: float, pixels: int) -> None:
+        self.freq_hz = freq_hz
+        self.waiting: list[tuple[Float, Float, Complex]] = []
+        self.count = 0
+        self.sums = np.zeros((5, pixels, pixels))
+        self.weight = 0.0
+
+
+class Images:
+    """Sums of images over blocks of visibilities; `finish` gives the cube."""
+
+    def __init__(self, imager: Imager, density: dict[float, Density] | None) -> None:
+        self.imager = imager
+        self.density = density
+        self.channels: dict[float, _Channel] = {}
+        self.centre: Any = None
+
+    def add(self, block: Visibilities) -> None:
+        """Add a block."""
+        self.centre = self.centre or block.phase_centre
+        if block.phase_centre != self.centre:
+            raise InputError("blocks with different phase centres cannot be imaged together")
+        stokes = None
+        for f, freq in enumerate(block.freq_hz):
+            channel = self.channels.setdefault(float(freq), _Channel(float(freq), self.imager.pixels))
+            uvw, weight, use = self.imager.chosen(block, f)
+            if not len(weight):
+                continue
+            if self.density is not None:
+                factor = self.density[float(freq)].factor(uvw[:, :2], self.imager.weighting, self.imager.robust)
+                weight = weight * factor
+            stokes = block.stokes() if stokes is None else stokes
+            channel.waiting.append((uvw, weight, stokes[:, f][use]))
+            channel.count += len(weight)
+            if channel.count >= HELD:
+                self._grid(channel)
+
+    def _grid(self, channel: _Channel) -> None:
+        """Sum_k w_k V_k exp(+2 pi i (u l + v m + w (n-1))), real part, for I, Q, U, V and for V = 1."""
+        if not channel.count:
+            return
+        from ducc0.wgridder.experimental import vis2dirty
+
+        uvw, weight, stokes = (np.concatenate(parts) for parts in zip(*channel.waiting, strict=True))
+        columns = [*np.moveaxis(stokes, -1, 0), np.ones(len(weight), complex)]
+        for image, values in zip(channel.sums, columns, strict=True):
+            if not values.any():  # a Stokes parameter that is exactly zero
+                continue
+            # ducc0 has exp(+2 pi i (u l + v m - w (n-1))) for the adjoint: flip w; x to the west: flip u
+            image += vis2dirty(
+                uvw=uvw * (LIGHT / channel.freq_hz),
+                freq=np.array([channel.freq_hz]),
+                vis=np.ascontiguousarray(values)[:, None],
+                wgt=weight[:, None],
+                npix_x=self.imager.pixels,
+                npix_y=self.imager.pixels,
+                pixsize_x=self.imager.pixel,
+                pixsize_y=self.imager.pixel,
+                epsilon=self.imager.accuracy,
+                do_wgridding=True,
+                divide_by_n=False,
+                flip_u=True,
+                flip_w=True,
+                nthreads=0,
+            ).T
+        channel.weight += float(weight.sum())
+        channel.waiting, channel.count = [], 0
+
+    def finish(self) -> StokesCube:
+        """The cube in Jy/beam; a channel without any visibility is NaN; raises when no channel has one."""
+        from astropy import units as u
+
+        planes, psfs = [], []
+        freqs = sorted(self.channels)
+        for freq in freqs:
+            channel = self.channels[freq]
+            self._grid(channel)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                images = channel.sums / channel.weight
+            planes.append(images[:4])
+            psfs.append(images[4])
+        if not any(self.channels[f].weight for f in freqs):
+            raise RefusedError(f"no visibility lies within uv_range = {self.imager.uv_range} with a weight above 0")
+        return StokesCube(
+            data=np.stack(planes),
+            frequencies=np.array(freqs) * u.Hz,
+            pixel=self.imager.pixel * u.rad,
+            unit="Jy/beam",
+            centre=self.centre,
+            psf=fit_psf(np.stack(psfs), self.imager.pixel),
+        )

@@ -1,0 +1,192 @@
+"""The text of BBS sky models: format line, defaults, quotes, brackets and angles, as named fields of each line."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from instrument.errors import FileError, did_you_mean
+
+FIELDS = (
+    "Name", "Type", "Patch", "Ra", "Dec", "I", "Q", "U", "V", "MajorAxis", "MinorAxis", "Orientation",
+    "OrientationIsAbsolute", "ReferenceFrequency", "SpectralIndex", "LogarithmicSI", "RotationMeasure",
+    "PolarizedFraction", "PolarizationAngle", "ReferenceWavelength", "RefType", "rah", "rad", "ram", "ras", "dech",
+    "decd", "decm", "decs",
+)  # fmt: skip
+KNOWN = {name.lower(): name for name in FIELDS}
+SKIPPED = {"", "dummy", "category", "ishapelet", "qshapelet", "ushapelet", "vshapelet"}
+WITHOUT_FORMAT_LINE = "Name,Type,Ra,Dec,I,Q,U,V,MajorAxis,MinorAxis,Orientation"
+FORMAT = re.compile(r"\s*(?:#\s*\((?P<hash>.*)\)\s*=\s*format\s*$|format\s*=(?P<plain>.*))", re.IGNORECASE)
+FIELD = re.compile(r"(?P<name>[\w:]*)\s*(?:=\s*(?P<fixed>fixed)?\s*(?P<quote>['\"])(?P<value>.*)(?P=quote))?", re.I)
+HOURS = re.compile(r"([+-]?)(\d+)(?::(\d+):(\d+\.?\d*)|h(\d+)m(\d+\.?\d*)s?)")
+DEGREES = re.compile(r"([+-]?)(\d+)(?:\.(\d+)\.(\d+\.?\d*)|d(\d+)m(\d+\.?\d*)s?)")
+WITH_UNIT = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*(deg|rad)", re.IGNORECASE)
+
+
+def broken(path: Path, line: int | None, message: str, kind: str = "line") -> FileError:
+    """The one-line error of a file: its name, the line or row, what is wrong and the remedy."""
+    return FileError(f"{path.name}, {kind} {line}: {message}" if line is not None else f"{path.name}: {message}")
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of data: its fields by lower-case name, "" where empty or absent."""
+
+    path: Path
+    number: int
+    values: dict[str, str]
+
+    def __getitem__(self, field: str) -> str:
+        return self.values.get(field.lower(), "")
+
+    def fail(self, message: str) -> FileError:
+        return broken(self.path, self.number, message)
+
+    def real(self, field: str, default: float | None = None) -> float:
+        text = self[field]
+        if not text:
+            if default is None:
+                raise self.fail(f"{field} is missing; give its value, or a default {field}='...' in the format line")
+            return default
+        return self.parsed(field, text)
+
+    def parsed(self, field: str, text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            raise self.fail(f"{field} = '{text}' is not a number") from None
+        if not np.isfinite(value):
+            raise self.fail(f"{field} = '{text}' is not finite; give its value or remove the source")
+        return value
+
+    def flag(self, field: str, default: bool) -> bool:
+        text = self[field].lower()
+        if text in ("", "true", "t", "yes", "1"):
+            return bool(text) or default
+        if text in ("false", "f", "no", "0"):
+            return False
+        raise self.fail(f"{field} = '{self[field]}' is neither true nor false")
+
+    def terms(self) -> list[float]:
+        text = self["SpectralIndex"]
+        inside = text[1:-1].strip() if text.startswith("[") and text.endswith("]") else text
+        return [self.parsed("SpectralIndex", t.strip()) for t in inside.split(",")] if inside else []
+
+
+def split(text: str) -> list[str]:
+    """The fields between commas outside brackets and quotes, trimmed; raises `ValueError` when one is not closed."""
+    parts, depth, quote, start = [], 0, "", 0
+    for k, c in enumerate(text):
+        if quote:
+            quote = "" if c == quote else quote
+        elif c in "'\"":
+            quote = c
+        elif c in "[]":
+            depth += 1 if c == "[" else -1
+            if depth < 0:
+                break
+        elif c == "," and not depth:
+            parts.append(text[start:k].strip())
+            start = k + 1
+    if quote or depth:
+        raise ValueError(f"{'a quote' if quote else 'a bracket'} is not closed in '{text.strip()}'")
+    return [*parts, text[start:].strip()]
+
+
+def _format(path: Path, number: int | None, text: str) -> list[tuple[str, str | None, str | None]]:
+    """Lower-case name, default and fixed value of each field of a format line."""
+    fields: list[tuple[str, str | None, str | None]] = []
+    try:
+        parts = split(text)
+    except ValueError as error:
+        raise broken(path, number, str(error)) from None
+    for part in parts:
+        match = FIELD.fullmatch(part)
+        if match is None:
+            raise broken(
+                path, number, f"'{part}' in the format line is not Field or Field='value', separated by commas"
+            )
+        name = match["name"].lower()
+        if name not in KNOWN and name not in SKIPPED:
+            hint = did_you_mean(match["name"], FIELDS)
+            raise broken(path, number, f"unknown field '{match['name']}': {hint}; call it 'dummy' to skip it")
+        if name in KNOWN and any(name == f[0] for f in fields):
+            raise broken(path, number, f"field '{match['name']}' stands twice in the format line; remove one")
+        value = match["value"]
+        fields.append((name, None if match["fixed"] else value, value if match["fixed"] else None))
+    return fields
+
+
+def is_bbs(lines: Sequence[str]) -> bool:
+    """Whether text has a format line, or without one a first source of a type that BBS knows."""
+    data = [t for t in lines if t.strip() and not t.lstrip().startswith("#")][:1]
+    kind = [p.strip().lower() for p in data[0].split(",")][1:2] if data else []
+    return any(FORMAT.match(t) for t in lines[:1000]) or kind in (["point"], ["gaussian"])
+
+
+def lines_of(path: Path, text: Sequence[str]) -> list[Line]:
+    """The data lines with their fields named, defaults filled in."""
+    fields = None
+    found = []
+    for number, raw in enumerate(text, 1):
+        header = FORMAT.match(raw)
+        if header and (fields is None or header["plain"] is not None):
+            if fields is not None:
+                raise broken(path, number, "a format line after the first one, or after a source; keep one, at the top")
+            fields = _format(path, number, header["hash"] if header["plain"] is None else header["plain"])
+        if header or not raw.strip() or raw.lstrip().startswith("#"):
+            continue
+        if fields is None:
+            fields = _format(path, None, WITHOUT_FORMAT_LINE)
+        try:
+            given = split(raw)
+        except ValueError as error:
+            raise broken(path, number, str(error)) from None
+        if any(given[len(fields) :]):
+            raise broken(path, number, f"{len(given)} values for the {len(fields)} fields of the format line")
+        values = {}
+        for k, (name, default, fixed) in enumerate(fields):
+            value = given[k] if k < len(given) else ""
+            if len(value) > 1 and value[0] in "'\"" and value[0] == value[-1]:
+                value = value[1:-1].strip()
+            values[name] = fixed if fixed is not None else value or default or ""
+        found.append(Line(path, number, values))
+    return found
+
+
+def angle(line: Line, field: str) -> float | None:
+    """Ra or Dec in rad, from one field or from its parts; `None` where nothing is given."""
+    right = field == "Ra"
+    text, pattern = line[field], HOURS if right else DEGREES
+    if text:
+        if ":" in text and not right:
+            raise line.fail(f"Dec = '{text}' has colons, which mean hours; write +dd.mm.ss.s, or degrees like 48.2deg")
+        number, sexagesimal = WITH_UNIT.fullmatch(text), pattern.fullmatch(text)
+        if number:
+            scale = 1.0 if number[2].lower() == "deg" else 180 / np.pi
+            degrees = float(number[1]) * scale
+        elif sexagesimal and all(float(x) < 60 for x in sexagesimal.groups()[2:] if x):
+            sign, whole, *rest = sexagesimal.groups()
+            minutes, seconds = (float(x) for x in rest if x is not None)
+            degrees = (float(whole) + minutes / 60 + seconds / 3600) * (-1 if sign == "-" else 1) * (15 if right else 1)
+        else:
+            form = "hh:mm:ss.s, or degrees like 123.4deg" if right else "+dd.mm.ss.s, or degrees like 48.2deg"
+            raise line.fail(f"{field} = '{text}' is not an angle; write {form}")
+    else:
+        stem = field.lower()
+        parts = [f"{stem}{p}" for p in "hdms"]
+        if not any(line[p] for p in parts):
+            return None
+        if line[parts[0]] and line[parts[1]]:
+            raise line.fail(f"{parts[0]} and {parts[1]} are both given; keep one")
+        first = parts[0] if line[parts[0]] else parts[1]
+        size = abs(line.real(first, 0.0)) + line.real(parts[2], 0.0) / 60 + line.real(parts[3], 0.0) / 3600
+        degrees = size * (-1 if line[first].startswith("-") else 1) * (15 if first == parts[0] else 1)
+    limit = 360 if right else 90
+    if abs(degrees) > limit:
+        raise line.fail(f"{field} of {degrees:g} deg lies beyond {limit} deg")
+    return float(np.deg2rad(degrees))
