@@ -1,4 +1,4 @@
-"""Instrument: a layout of stations and the chain of Jones terms of each; its beam and Mueller matrices for those who want only those."""
+"""Instrument: a layout of stations and the chain of Jones terms of each; its beam and its Mueller matrices."""
 
 from __future__ import annotations
 

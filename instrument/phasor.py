@@ -19,7 +19,7 @@ FAST = {"contract", "nsz", "nnan", "ninf"}  # no reassociation: sums keep their 
 CHUNK = 256
 
 
-@numba.njit(inline="always")  # type: ignore[untyped-decorator]
+@numba.njit(inline="always")
 def cis(cycles: float) -> Any:
     """Cosine and sine of 2 pi `cycles`; Taylor series on an eighth of a turn, error below 1.2e-16."""
     q = np.rint(4.0 * cycles)
@@ -42,7 +42,7 @@ def cis(cycles: float) -> Any:
     return cosine, sine
 
 
-@numba.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
 def _array_factor(waves: Any, offsets: Any, out: Any) -> None:
     rows, _, count = waves.shape
     units, parts, _ = offsets.shape
@@ -79,7 +79,7 @@ def array_factor_reference(waves: Float, offsets_m: Float) -> Complex:
     return np.asarray(np.exp(2j * np.pi * np.einsum("ncs,umc->nums", waves, offsets_m)).mean(axis=2))
 
 
-@numba.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
 def _station_phases(uvw: Any, lmn: Any, out: Any) -> None:
     rows, stations, _ = uvw.shape
     count = lmn.shape[1]

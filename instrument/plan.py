@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -19,8 +18,7 @@ from instrument.observe.observation import Observation
 from instrument.observe.sampling import Sampling
 from instrument.predict.base import Predictor, Problem, Work
 from instrument.sky.base import Sky
-from instrument.sky.points import PointSky
-from instrument.units import Float, si_prefix, to_si
+from instrument.units import si_prefix, to_si
 from instrument.visibilities import Visibilities
 
 BLOCK_BYTES = 64e6
@@ -102,16 +100,17 @@ class Plan:
         times, channels, baselines = self.full.shape
         stations, sources = self.full.at.shape[2:]
         head = (
-            f"scene {self.name}: {_count(stations, 'station')}, {_count(baselines, 'baseline')}, {_count(times, 'time')}, "
-            f"{_count(channels, 'channel')}, {_count(sources, 'direction')}, tolerance {self.tolerance:g}"
+            f"scene {self.name}: {_count(stations, 'station')}, {_count(baselines, 'baseline')}, "
+            f"{_count(times, 'time')}, {_count(channels, 'channel')}, {_count(sources, 'direction')}, "
+            f"tolerance {self.tolerance:g}"
         )
         lines = [head]
         lines += [f"kept          {i.name:<22} {i.reason}" for i in self.kept]
         lines += [f"left out      {i.name:<22} {i.reason:<46} error {i.bound:.2g}" for i in self.left_out]
         lines += [f"not modelled  {i.name:<22} {i.reason}" for i in self.not_modelled]
         lines.append(
-            f"engine        {self.engine_name:<22} {si_prefix(self.work.flops, 'Flop')}, about {_seconds(self.seconds)}, "
-            f"peak {si_prefix(self.memory, 'B')} in {_count(len(self.slices), 'block')}"
+            f"engine        {self.engine_name:<22} {si_prefix(self.work.flops, 'Flop')}, "
+            f"about {_seconds(self.seconds)}, peak {si_prefix(self.memory, 'B')} in {_count(len(self.slices), 'block')}"
         )
         lines += [f"refused       {i.name:<22} {i.reason}" for i in self.refused]
         inside = ", ".join(f"{i.name} {i.bound:.1e}" for i in (*self.left_out, *self.bounds) if i.bound)
@@ -125,7 +124,7 @@ class Plan:
         if whole + self.memory > self.limit:
             raise RefusedError(
                 f"{si_prefix(whole + self.memory, 'B')} of visibilities and blocks exceed the limit of "
-                f"{si_prefix(self.limit, 'B')}: take them one by one with plan.blocks(), or give fewer times or channels"
+                f"{si_prefix(self.limit, 'B')}: take blocks one by one with plan.blocks(), or fewer times or channels"
             )
         data = np.empty((times, channels, baselines, 2, 2), complex)
         for (t, f), block in zip(self.slices, self.blocks(executor, progress), strict=True):
@@ -173,6 +172,19 @@ class Plan:
             for future in waiting:
                 future.cancel()
 
+    def coverage(self) -> Iterator[Visibilities]:
+        """Coordinates of all blocks with data of zero, which take no memory: for weights before any prediction."""
+        for times, channels in self.slices:
+            block = self.problem.block(times, channels)
+            yield Visibilities(
+                data=np.broadcast_to(np.zeros((), complex), (*block.shape, 2, 2)),
+                at=block.at.at_centre(),
+                antenna1=block.antenna1,
+                antenna2=block.antenna2,
+                interval_s=block.interval_s,
+                width_hz=block.width_hz,
+            )
+
     def verify(self, samples: int = 64, seed: int = 0) -> Check:
         """Recompute random visibilities of the scene as it was given with `direct`, and compare.
 
@@ -206,6 +218,7 @@ def make_plan(
     tolerance: float = 0.0,
     engine: str | None = None,
     memory: Any = None,
+    workers: int | None = None,
 ) -> Plan:
     """Work out the plan of a scene; see `Scene.plan`."""
     if not (np.isfinite(tolerance) and tolerance >= 0):
@@ -218,14 +231,15 @@ def make_plan(
     _must_rise(at)
     a, b = layout.baselines
     full = Problem(at, chain, sky, a, b, observation.interval, observation.width_hz)
-    kept, left_out = [], []
+    kept: list[Item] = []
+    left_out: list[Item] = []
     chain = _simplify_chain(chain, at, tolerance, kept, left_out)
     problem = _simplify_sky(full, chain, left_out)
     if chain.structure != "full" or not chain.parts:
         left_out.append(Item("2x2 algebra", f"the chain is {chain.structure if chain.parts else 'the identity'}"))
     found, label, refused = _choose(problem, engine)
     limit = _limit(memory)
-    workers = os.cpu_count() or 1
+    workers = workers or os.cpu_count() or 1
     shape, work, peak = _blocks(found, problem, workers, limit)
     return Plan(
         name=name,
@@ -357,10 +371,13 @@ def _choose(problem: Problem, name: str | None) -> tuple[Predictor, str, list[It
 
 
 def _limit(memory: Any) -> float:
-    if memory is not None:
-        return float(to_si(memory, "byte", "memory"))
+    return 0.75 * machine_memory() if memory is None else float(to_si(memory, "byte", "memory"))
+
+
+def machine_memory() -> float:
+    """Memory of this machine in bytes; 8 GB where it cannot be asked."""
     try:
-        return 0.75 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     except (AttributeError, ValueError, OSError):
         return 8e9
 

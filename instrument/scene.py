@@ -14,21 +14,30 @@ from instrument.sky.base import Sky
 
 
 class Scene(Component):
-    """What is observed, with what, and when. `plan()` says what would be done; nothing is computed before `plan.run()`."""
+    """What is observed, with what, and when; `plan()` says what would be done, nothing is computed before `run`."""
 
     name: str = "scene"
     instrument: SerializeAsAny[Instrument]
     sky: SerializeAsAny[Sky]
     observation: Observation
 
-    def plan(self, tolerance: float = 0.0, engine: str | None = None, memory: Any = None) -> Plan:
+    def plan(
+        self, tolerance: float = 0.0, engine: str | None = None, memory: Any = None, workers: int | None = None
+    ) -> Plan:
         """What is kept, what is left out and why, by which engine, at what cost and error bound.
 
         `tolerance` bounds the error that may be made, relative to the total flux of the sky (0: exact omissions only);
         `engine` names one instead of the cheapest; `memory` ("8 GB") is the most the run may take, three quarters of
-        the machine by default. Raises `InputError` for impossible scenes and `RefusedError` when no engine or not
-        enough memory serves.
+        the machine by default; `workers` the number of threads. Raises `InputError` for impossible scenes and
+        `RefusedError` when no engine or not enough memory serves.
         """
         return make_plan(
-            self.name, self.instrument, self.sky, self.observation, tolerance=tolerance, engine=engine, memory=memory
+            self.name,
+            self.instrument,
+            self.sky,
+            self.observation,
+            tolerance=tolerance,
+            engine=engine,
+            memory=memory,
+            workers=workers,
         )

@@ -94,7 +94,7 @@ class ArrayOf:
         def check(value: object, info: core_schema.ValidationInfo) -> Any:
             if isinstance(value, dict) and {"real", "imag"} <= set(value):
                 value = np.array(value["real"], float) + 1j * np.array(value["imag"], float)
-            array = np.array(value, dtype=self.dtype)
+            array: Any = np.array(value, dtype=self.dtype)
             fits = array.ndim == len(self.shape) and all(
                 n in (None, m) for n, m in zip(self.shape, array.shape, strict=True)
             )

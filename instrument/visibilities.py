@@ -22,7 +22,7 @@ from instrument.units import Bool, Complex, Direction, Float, Int, to_si
 
 @dataclass(frozen=True)
 class BeamState:
-    """What has been taken out of visibilities, and towards where: "nothing" (absolute beam) or "centre" (differential)."""
+    """What has been taken out of visibilities: "nothing" or "centre" (the beam), and towards where."""
 
     removed: Literal["nothing", "centre"] = "nothing"
     towards: Direction | None = None
@@ -145,10 +145,10 @@ class Visibilities:
         return replace(self, data=noisy)
 
     def corrected(self, term: JonesTerm | Chain) -> Visibilities:
-        """J_a^-1 V J_b^-H for a direction-independent term; visibilities of singular Jones matrices are flagged and zero."""
+        """J_a^-1 V J_b^-H for a direction-independent term; where a Jones matrix is singular: zero and flagged."""
         jones = self._station_jones(term)
         inverse = mat2.inverse(jones)
-        good = np.isfinite(inverse).all(axis=(-2, -1))
+        good = np.asarray(np.isfinite(inverse).all(axis=(-2, -1)))
         inverse = np.where(good[..., None, None], inverse, 0.0)
         data = mat2.sandwich(inverse[:, :, self._pick(inverse, 1)], self.data, inverse[:, :, self._pick(inverse, 2)])
         flag = self.flag | ~(good[:, :, self._pick(inverse, 1)] & good[:, :, self._pick(inverse, 2)])

@@ -159,7 +159,7 @@ def _kron(a: Complex, b: Complex) -> Complex:
 def expected_percent(
     chain: Chain, at: Sampling, stokes_jy: Float, channel: int = 0, differential: bool = True
 ) -> Float:
-    """Linear and circular polarization in % of I (S, 2) that sources of Stokes (S, 4) should show, from the beam model."""
+    """Linear and circular polarization in % of I (S, 2) that sources of Stokes (S, 4) should show: the beam model's."""
     seen = np.einsum("sij,sj->si", mean_mueller(chain, at, differential)[channel], stokes_jy).real
     with np.errstate(divide="ignore", invalid="ignore"):
         return 100 * np.stack([np.hypot(seen[:, 1], seen[:, 2]), np.abs(seen[:, 3])], axis=1) / np.abs(seen[:, :1])

@@ -122,7 +122,7 @@ class PhotometrySums:
                     assert slot.weight is not None
                     values = np.where(slot.weight[:, None] > 0, stokes[k, f], 0.0) * slot.weight[:, None]
                 channel.right += self._adjoint(slot, values)
-                channel.total += float(len(weight) if plain else np.sum(slot.weight))
+                channel.total += float(len(weight) if slot.weight is None else slot.weight.sum())
 
     def _inside(self, uvw: Float, block: Visibilities) -> Float | None:
         if self.settings.uv_range is None:
@@ -223,7 +223,7 @@ class PhotometrySums:
         return self._conjugate_gradients(channel)
 
     def _psf_matrix(self, channel: _Channel) -> Float:
-        """PSF between all groups, (G, G), for equal weights: sum over a < b of Re x_a x_b^* = (|sum_a x_a|^2 - A) / 2."""
+        """PSF between all groups, (G, G), for equal weights: sum_{a<b} Re x_a x_b^* = (|sum_a x_a|^2 - A) / 2."""
         groups = len(self.first)
         out = np.zeros((len(self.group), len(self.group)))
         for slot in channel.slots:
@@ -263,7 +263,9 @@ class PhotometrySums:
 def _groups(sky: PointSky) -> tuple[Int, Int, tuple[str, ...]]:
     """First source of each group, group of each source, names of the groups; a patch is a group."""
     order: dict[str, int] = {}
-    first, group, names = [], [], []
+    first: list[int] = []
+    group: list[int] = []
+    names: list[str] = []
     for i, name in enumerate(sky.names):
         patch = sky.patches[i] if sky.patches else ""
         key = f"patch {patch}" if patch else f"source {i}"

@@ -34,7 +34,10 @@ class Density:
         self.total += float(weight.sum())
 
     def factor(self, uv: Float, weighting: Weighting, robust: float) -> Float:
-        """What to multiply natural weights by, (N,). Briggs (1995): 1/(1 + f2 density), f2 = (5 10^-R)^2 / mean density."""
+        """What to multiply natural weights by, (N,).
+
+        Uniform: 1/density. Briggs (1995): 1/(1 + f2 density), f2 = (5 10^-R)^2 / mean density.
+        """
         cells, inside = self._cells(uv)
         density = np.where(inside, self.sums[np.where(inside, cells, 0)], 0.0)
         if weighting == "uniform":

@@ -77,6 +77,11 @@ class Chain(Component):
         kinds = {t.per_station for t in self._shared_terms()}
         return len(layout) if "own" in kinds else len(layout.frames[0]) if "frame" in kinds else 1
 
+    def beams(self) -> Chain:
+        """The terms that differ between directions: the chain without its direction-independent left end."""
+        first = next((i for i, t in enumerate(self.terms) if any(p.directional for p in t.parts())), len(self.terms))
+        return Chain(*self.terms[first:])
+
     def _outer_count(self) -> int:
         return next((i for i, t in enumerate(self.parts) if t.directional), len(self.parts))
 

@@ -98,7 +98,7 @@ def _nearest(known: Float | None, asked: Float, count: int, what: str, unit: str
 
 
 def slot_normals(key: tuple[int, ...], slots_s: Float, shape: tuple[int, ...]) -> Complex:
-    """Complex normal numbers of unit power for each time slot, (T, *shape); a slot's draw depends on key and time only."""
+    """Complex normal numbers of unit power for each time slot, (T, *shape); a draw depends on key and time only."""
     out = np.empty((len(slots_s), *shape), complex)
     for row, slot in zip(out, slots_s, strict=True):
         rng = np.random.default_rng([*key, round(slot * 1000)])

@@ -23,7 +23,7 @@ def brightness(stokes: Float) -> Complex:
 
 
 def stokes(matrices: Complex) -> Complex:
-    """Stokes I, Q, U, V (..., 4), complex, of 2x2 matrices: I = (pp+qq)/2, Q = (pp-qq)/2, U = (pq+qp)/2, V = (pq-qp)/2i."""
+    """Stokes (..., 4), complex, of 2x2 matrices: I = (pp+qq)/2, Q = (pp-qq)/2, U = (pq+qp)/2, V = (pq-qp)/2i."""
     pp, pq, qp, qq = (matrices[..., i, j] for i in range(2) for j in range(2))
     return np.stack([(pp + qq) / 2, (pp - qq) / 2, (pq + qp) / 2, (pq - qp) / 2j], axis=-1)
 
@@ -70,7 +70,7 @@ class DIErrors:
         for i, row in enumerate(rows):
             for j, entry in enumerate(row):
                 out[..., i, j] = entry / 2
-        return out + np.eye(4)
+        return np.asarray(out + np.eye(4))
 
 
 def di_errors(jones_a: Complex, jones_b: Complex) -> DIErrors:
@@ -93,7 +93,7 @@ def di_errors(jones_a: Complex, jones_b: Complex) -> DIErrors:
 
 
 def ixr_jones(jones: Complex) -> Float:
-    """Intrinsic cross-polarization ratio ((k+1)/(k-1))^2 of Jones matrices, k the condition number (Carozzi & Woan 2011).
+    """Intrinsic cross-polarization ratio ((k+1)/(k-1))^2, k the condition number of J (Carozzi & Woan 2011).
 
     Infinity for a multiple of a unitary matrix, 1 for a singular one.
     """

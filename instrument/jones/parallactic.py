@@ -13,7 +13,7 @@ from instrument.units import Complex
 
 
 class Parallactic(JonesTerm):
-    """Rotation from the sky to the horizon basis, [[theta.north, theta.east], [phi.north, phi.east]], (T, 1, A, S, 2, 2).
+    """Sky to horizon basis, [[theta.north, theta.east], [phi.north, phi.east]], (T, 1, A, S, 2, 2).
 
     It holds the parallactic angle and the change of handedness between (north, east) and (theta, phi): its determinant
     is -1. At the zenith of a station e_theta is p.

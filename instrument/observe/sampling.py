@@ -17,8 +17,9 @@ from instrument.units import Direction, Float, unit_vectors
 class Sampling:
     """Where a Jones term is evaluated: T times, F channels, A stations, S directions.
 
-    Everything geometric is worked out when asked for, once. `seen` and `seen_east` override the directions (ITRF unit
-    vectors and the east vectors across them, (T, S, 3)) for work with another program's frames.
+    Everything geometric is worked out when asked for, once. `seen`, `seen_east` (T, S, 3) and `seen_centre` (T, 3)
+    override the ITRF directions, the east vectors across them and the phase centre, for work with another program's
+    frames; `towards` drops the first two, which belong to the directions.
     """
 
     layout: Layout
@@ -30,6 +31,7 @@ class Sampling:
     centre: Direction
     seen: Float | None = None
     seen_east: Float | None = None
+    seen_centre: Float | None = None
 
     @classmethod
     def build(
@@ -60,6 +62,7 @@ class Sampling:
             freq_hz=self.freq_hz[channels],
             seen=None if self.seen is None else self.seen[times],
             seen_east=None if self.seen_east is None else self.seen_east[times],
+            seen_centre=None if self.seen_centre is None else self.seen_centre[times],
         )
 
     def towards(self, ra_rad: Float, dec_rad: Float) -> Sampling:
@@ -90,6 +93,8 @@ class Sampling:
     @cached_property
     def centre_itrf(self) -> Float:
         """Apparent ITRF unit vector of the phase centre (T, 3)."""
+        if self.seen_centre is not None:
+            return self.seen_centre
         return self.earth.itrf(self.centre.vector[None])[:, 0]
 
     @cached_property

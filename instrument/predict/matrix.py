@@ -2,7 +2,7 @@
 
 The chain is written as (number per station) x (matrix shared by a group of stations); the shared matrices are absorbed
 into the brightness, C_gh = M_g B M_h^H, and Z = number x fringe is (stations, sources). The sky is never factored as a
-square root: one with P > I has none. The slow twin is `direct.py`; tests/accuracy/test_agreement.py holds them together.
+square root: one with P > I has none. The slow twin is `direct.py`; tests/accuracy/test_agreement.py compares them.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ def _point_sums(problem: Problem, factors: Factors, z: Complex, sky: Complex, ro
             back = np.flatnonzero(np.isin(problem.antenna1, of_h) & np.isin(problem.antenna2, of_g))
             if g == h:
                 back = back[:0]
-            block = np.ix_(of_g, of_h)
+            block: Any = np.ix_(of_g, of_h)
             for t in range(times):
                 for f in range(channels):
                     zg = z[t, f] if groups == 1 else z[t, f, of_g]
@@ -191,7 +191,7 @@ def _gaussian_sums(
     )
 
 
-@numba.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
 def _envelope_sum(left: Any, right: Any, uvw: Any, axes: Any, a1: Any, a2: Any, out: Any) -> None:
     scale = -2.0 * math.pi**2
     for n in range(left.shape[0]):

@@ -157,7 +157,7 @@ def _sky(path: Path, rows: list[dict[str, Any]], centre: Direction | None) -> Po
     squared = np.where(column("at_zero"), 0.0, given**2)
     linear = column("linear") * np.exp(2j * rm * ((LIGHT / frequency) ** 2 - squared))
     for k in np.flatnonzero(rotates & (column("wavelength") > 0) & (sky.stokes_jy[:, 0] != 0)):
-        linear[k] *= sky.stokes_jy[k, 0] / sky.select([k]).stokes(np.array([LIGHT / given[k]]))[0, 0, 0]
+        linear[k] *= sky.stokes_jy[k, 0] / sky.select([int(k)]).stokes(np.array([LIGHT / given[k]]))[0, 0, 0]
     fields: dict[str, Any] = {"stokes_jy": np.stack([column("i"), linear.real, linear.imag, column("v")], axis=1)}
     if (shape[:, :2] > 0).any():
         turned = ~column("absolute") & (shape[:, 0] != shape[:, 1])
@@ -168,10 +168,7 @@ def _sky(path: Path, rows: list[dict[str, Any]], centre: Direction | None) -> Po
 
 def _convergence(path: Path, sky: PointSky, centre: Direction | None, turned: Any) -> Float | float:
     """What turns an orientation in the l, m plane of the centre into one from the source's own north, rad (S,)."""
-    middle = sky.vectors.mean(axis=0)
-    at = centre or Direction(
-        float(np.arctan2(middle[1], middle[0])), float(np.arctan2(middle[2], np.hypot(*middle[:2])))
-    )
+    at = centre or sky.middle
     (east,), (north,) = tangents(np.array([at.ra_rad]), np.array([at.dec_rad]))
     own_north = tangents(sky.ra_rad, sky.dec_rad)[1]
     turn = -np.arctan2(own_north @ east, own_north @ north)
@@ -180,8 +177,8 @@ def _convergence(path: Path, sky: PointSky, centre: Direction | None, turned: An
     worst = np.abs(turn[turned]).max(initial=0.0)
     if worst > MISORIENTED:
         warnings.warn(
-            f"{path.name}: {turned.sum()} orientations count from the phase centre of the model, which is not given, and "
-            f"are taken as angles at the sources; about the middle of the file that turns them by up to "
+            f"{path.name}: {turned.sum()} orientations count from the phase centre of the model, which is not given, "
+            f"and are taken as angles at the sources; about the middle of the file that turns them by up to "
             f"{np.rad2deg(worst):.2g} deg; give it as read(path, centre=...)",
             InstrumentWarning,
             stacklevel=4,
@@ -203,10 +200,8 @@ def write_bbs(path: Any, sky: PointSky) -> None:
     out = [f"FORMAT = {', '.join(fields)}, OrientationIsAbsolute='true'", ""]
     _check_names(sky)
     for patch in dict.fromkeys(p for p in sky.patches if p):
-        inside = np.array([p == patch for p in sky.patches])
-        weight = np.abs(sky.stokes_jy[inside, 0])
-        x, y, z = (sky.vectors[inside] * (weight if weight.any() else weight + 1)[:, None]).sum(axis=0)
-        out.append(f", , {patch}, {_degrees(np.arctan2(y, x))}, {_degrees(np.arctan2(z, np.hypot(x, y)))}")
+        middle = sky.select([k for k, p in enumerate(sky.patches) if p == patch]).middle
+        out.append(f", , {patch}, {_degrees(middle.ra_rad)}, {_degrees(middle.dec_rad)}")
     out += [", ".join(_written(sky, k)) for k in range(len(sky))]
     Path(path).write_text("\n".join(out) + "\n", encoding="utf-8")
 
@@ -237,13 +232,13 @@ def _written(sky: PointSky, k: int) -> list[str]:
     i, q, u, v = sky.stokes_jy[k].tolist()
     terms, rm, follows = of(sky.spectral_terms, []), of(sky.rotation_measure), of(sky.polarization_follows_i, False)
     curved, linear = any(terms), bool(q or u)
-    if curved and ((follows and v) or (linear and rm and not follows) or (linear and follows and not i)):
+    if curved and (((follows or rm) and v) or (linear and rm and not follows) or (linear and follows and not i)):
         raise InputError(
             f"source '{sky.names[k]}': BBS text has Q and U follow the spectrum of I exactly where there is a rotation "
             "measure, V never, and none of them with I = 0; remove the spectral terms, the rotation measure or V"
         )
-    if rm and linear and not i:
-        raise InputError(f"source '{sky.names[k]}': BBS text takes a rotating Q and U as a fraction of I, which is 0")
+    if rm and not i:
+        raise InputError(f"source '{sky.names[k]}': BBS text takes Q and U that rotate as a fraction of I, which is 0")
     shaped = bool(sky.gaussian[k])
     right_ascension = sky.ra_rad[k] if abs(sky.ra_rad[k]) < 2 * np.pi else sky.ra_rad[k] % (2 * np.pi)
     return [

@@ -44,9 +44,11 @@ class Line:
         return self.values.get(field.lower(), "")
 
     def fail(self, message: str) -> FileError:
+        """The error to raise about this line."""
         return broken(self.path, self.number, message)
 
     def real(self, field: str, default: float | None = None) -> float:
+        """A field as a finite number; the default where it is empty."""
         text = self[field]
         if not text:
             if default is None:
@@ -55,6 +57,7 @@ class Line:
         return self.parsed(field, text)
 
     def parsed(self, field: str, text: str) -> float:
+        """Text of a field as a finite number."""
         try:
             value = float(text)
         except ValueError:
@@ -64,6 +67,7 @@ class Line:
         return value
 
     def flag(self, field: str, default: bool) -> bool:
+        """A field as true or false."""
         text = self[field].lower()
         if text in ("", "true", "t", "yes", "1"):
             return bool(text) or default
@@ -72,6 +76,7 @@ class Line:
         raise self.fail(f"{field} = '{self[field]}' is neither true nor false")
 
     def terms(self) -> list[float]:
+        """Spectral terms, [] where none are given."""
         text = self["SpectralIndex"]
         inside = text[1:-1].strip() if text.startswith("[") and text.endswith("]") else text
         return [self.parsed("SpectralIndex", t.strip()) for t in inside.split(",")] if inside else []

@@ -164,9 +164,12 @@ class PointSky(Sky):
         """The `count` sources of largest |I| + P, in their own order."""
         if count < 1:
             raise InputError(f"brightest = {count} sources: at least one is needed")
-        s = self.stokes_jy
-        power = np.abs(s[:, 0]) + np.sqrt((s[:, 1:] ** 2).sum(axis=1))
-        return self.select(np.sort(np.argsort(-power, kind="stable")[:count]))
+        return self.select(np.sort(np.argsort(-self.power_jy, kind="stable")[:count]))
+
+    @property
+    def power_jy(self) -> Float:
+        """|I| + P at the reference frequencies, P = sqrt(Q^2 + U^2 + V^2), Jy (S,)."""
+        return np.asarray(np.abs(self.stokes_jy[:, 0]) + np.sqrt((self.stokes_jy[:, 1:] ** 2).sum(axis=1)))
 
     def directions(self) -> tuple[Float, Float]:
         """ICRS right ascension and declination, rad (S,)."""
@@ -176,6 +179,13 @@ class PointSky(Sky):
     def vectors(self) -> Float:
         """ICRS unit vectors (S, 3)."""
         return unit_vectors(self.ra_rad, self.dec_rad)
+
+    @property
+    def middle(self) -> Direction:
+        """Mean direction of the sources, weighted with |I| (evenly where all I are 0)."""
+        weight = np.abs(self.stokes_jy[:, 0])
+        x, y, z = (weight if weight.any() else weight + 1) @ self.vectors
+        return Direction(float(np.arctan2(y, x)), float(np.arctan2(z, np.hypot(x, y))))
 
     def distance_rad(self, centre: Direction) -> Float:
         """Angle from a direction, rad (S,)."""
@@ -246,8 +256,8 @@ class PointSky(Sky):
         minor = -np.sin(angle)[:, None] * north + np.cos(angle)[:, None] * east
         e0, n0 = tangents(np.array([centre.ra_rad]), np.array([centre.dec_rad]))
         axes = np.stack([e0[0], n0[0], centre.vector])
-        out[:, 0] = FWHM_TO_SIGMA * self.major_rad[:, None] * (major @ axes.T)
-        out[:, 1] = FWHM_TO_SIGMA * self.minor_rad[:, None] * (minor @ axes.T)
+        out[:, 0] = FWHM_TO_SIGMA * np.asarray(self.major_rad)[:, None] * (major @ axes.T)
+        out[:, 1] = FWHM_TO_SIGMA * np.asarray(self.minor_rad)[:, None] * (minor @ axes.T)
         return out
 
     def flux_kinds(self, freq_hz: Float) -> tuple[bool, bool, bool, bool]:

@@ -17,8 +17,8 @@ from instrument.units import Complex, Metres, Radians
 class CrossedDipole(ElementBeam):
     """Ideal crossed dipoles `height` above a perfect ground plane, (T, F, A, S, 2, 2).
 
-    J = sin(2 pi h/lambda cos theta) [[cos theta cos a, -sin a], [cos theta sin a, cos a]], a = azimuth - azimuth of X; the
-    second row is that of the Y dipole, 90 deg further from p (east) to q (north). 1 at the zenith for h = lambda/4.
+    J = sin(2 pi h/lambda cos theta) [[cos theta cos a, -sin a], [cos theta sin a, cos a]], a = azimuth - azimuth of X;
+    the second row is that of the Y dipole, 90 deg further from p (east) to q (north). 1 at the zenith for h = lambda/4.
     Closed form of image theory (for example Balanis, Antenna Theory, chapter 4). Zero below the plane.
     """
 

@@ -16,13 +16,13 @@ X_AZIMUTH = np.deg2rad(225.0)  # of the +X dipole, from p (east) towards q (nort
 
 
 class Hamaker(ElementBeam):
-    """LOFAR dual-dipole element, (T, F, A, S, 2, 2): two azimuthal harmonics, polynomials in zenith angle and frequency.
+    """LOFAR dual-dipole element, (T, F, A, S, 2, 2): two azimuthal harmonics, polynomials in theta and frequency.
 
     p_d(theta, x) = sum_ij C[k, i, j, d] theta^i x^j with x = (f - f0) / df, and
-    J = sum_k [[cos a p_theta, -sin a p_phi], [sin a p_theta, cos a p_phi]], a = (-1)^k (2k+1) phi, phi from the +X dipole.
-    The minus sign on p_phi of Hamaker (2011) is already in the distributed coefficients. Zero at and below the antenna
-    plane; outside its band it extrapolates. At the zenith the second harmonic leaves a jump of 2e-3 in azimuth, which is
-    the model's own.
+    J = sum_k [[cos a p_theta, -sin a p_phi], [sin a p_theta, cos a p_phi]], a = (-1)^k (2k+1) phi, phi from the +X
+    dipole. The minus sign on p_phi of Hamaker (2011) is already in the distributed coefficients. Zero at and below the
+    antenna plane; outside its band it extrapolates. At the zenith the second harmonic leaves a jump of 2e-3 in azimuth,
+    which is the model's own.
     """
 
     band: Literal["hba", "lba"] = "hba"
@@ -52,7 +52,7 @@ class Hamaker(ElementBeam):
 
     @staticmethod
     def _patterns(folded: Complex, theta: Float) -> list[list[Complex]]:
-        """p_theta and p_phi of each harmonic at zenith angles (T, 1, A, S), by Horner's rule: [k][d] of (T, F, A, S)."""
+        """p_theta and p_phi of each harmonic at zenith angles (T, 1, A, S), by Horner: [k][d] of (T, F, A, S)."""
         found = []
         for k in range(folded.shape[0]):
             pair = []

@@ -1,0 +1,100 @@
+"""Doctor: versions, tables, threads, memory and a self-test of this installation, in a few seconds."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
+
+import numpy as np
+
+NEEDED = (
+    "numpy",
+    "scipy",
+    "astropy",
+    "astropy-iers-data",
+    "pyerfa",
+    "pydantic",
+    "numba",
+    "ducc0",
+    "threadpoolctl",
+    "matplotlib",
+    "jinja2",
+    "rich",
+)
+OPTIONAL = {
+    "distributed": "blocks on a Dask cluster",
+    "everybeam": "peer tests",
+    "dp3": "peer tests",
+    "python-casacore": "peer tests",
+}
+
+
+def doctor(show: Callable[[str], None]) -> bool:
+    """Print what works; true when the self-test passes and no plugin is broken."""
+    show(f"python        {platform.python_version()} on {platform.platform()}")
+    for name in NEEDED:
+        show(f"{name:<20} {_version(name)}")
+    for name, use in OPTIONAL.items():
+        show(f"{name:<20} {_version(name)} (optional: {use})")
+    show(f"cores         {os.cpu_count()}")
+    show(f"memory        {_memory_gb():.1f} GB")
+    show(f"Earth table   measured and predicted to {_table_end()}")
+    fine = True
+    from instrument.registry import KINDS, available
+
+    for kind in KINDS:
+        for plugin in available(kind).values():
+            if plugin.broken:
+                fine = False
+                show(f"BROKEN        {plugin.broken}")
+    error = self_test()
+    good = error < 1e-12
+    verdict = "right" if good else "WRONG"
+    show(f"self-test     matrix against direct, 4 stations, 9 polarized sources: {error:.1e} ({verdict})")
+    return fine and good
+
+
+def self_test() -> float:
+    """Largest relative difference of the fast engine and the definition on a small scene."""
+    from astropy import units as u
+
+    import instrument
+
+    stations = ["CS001HBA0", "CS002HBA1", "RS406HBA", "RS508HBA"]
+    observation = instrument.Observation(
+        phase_centre="08h13m36.0s +48d13m03s",
+        transit="2012-12-07",
+        duration=2 * u.hour,
+        interval=1 * u.hour,
+        frequencies=[150] * u.MHz,
+    )
+    sky = instrument.load("skies", "random", count=9, radius=4 * u.deg, polarization=0.3, seed=1)
+    scene = instrument.Scene(
+        instrument=instrument.load("telescopes", "lofar-hba", stations=stations), sky=sky, observation=observation
+    )
+    fast, slow = (scene.plan(engine=name).run().data for name in ("matrix", "direct"))
+    return float(np.abs(fast - slow).max() / np.abs(slow).max())
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def _memory_gb() -> float:
+    from instrument.plan import machine_memory
+
+    return machine_memory() / 1e9
+
+
+def _table_end() -> str:
+    from astropy.time import Time
+    from astropy.utils import iers
+
+    with iers.conf.set_temp("auto_download", False), iers.conf.set_temp("auto_max_age", None):
+        table = iers.earth_orientation_table.get()
+        return str(Time(table["MJD"][-1].to_value("d"), format="mjd").isot[:10])

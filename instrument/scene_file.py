@@ -1,0 +1,242 @@
+"""Scene files: TOML tables, one per stage, read and checked before anything runs."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from instrument.analyze.photometry import ForcedPhotometry
+from instrument.component import Component
+from instrument.errors import FileError, InputError, did_you_mean
+from instrument.image.dirty import Imager
+from instrument.jones.feed import FeedTerm
+from instrument.jones.gain import GainTerm
+from instrument.model import Instrument
+from instrument.observe.observation import Observation
+from instrument.registry import available, load
+from instrument.scene import Scene
+from instrument.sky.base import Sky
+from instrument.units import Float, Hertz, HertzArray, Instant, Jansky, Seconds, SkyDirection
+
+SEED_STEP = 1000  # seeds of the stages of a scene are derived from its one seed
+
+
+class Frequency(Component):
+    """Channels: `centre` of the band, `width` of one channel (also their spacing), how many."""
+
+    centre: Hertz
+    width: Hertz
+    channels: int = Field(default=1, ge=1)
+
+    def values_hz(self) -> Float:
+        """Channel centres, Hz (F,)."""
+        return np.asarray(self.centre + self.width * (np.arange(self.channels) - (self.channels - 1) / 2))
+
+
+class ObservationTable(Component):
+    """The table [observation]: an `Observation`, its channels as `frequency` or as a list `frequencies`."""
+
+    phase_centre: SkyDirection
+    start: Instant | None = None
+    transit: str | None = None
+    duration: Seconds
+    interval: Seconds
+    frequency: Frequency | None = None
+    frequencies: HertzArray | None = None
+    channel_width: Hertz | None = None
+
+    def observation(self) -> Observation:
+        """The observation it describes."""
+        from astropy import units as u
+
+        if (self.frequency is None) == (self.frequencies is None):
+            raise InputError("[observation] needs 'frequency' or 'frequencies', and not both")
+        values = self.frequency.values_hz() if self.frequency else self.frequencies
+        width = self.frequency.width if self.frequency else self.channel_width
+        return Observation(
+            phase_centre=self.phase_centre,
+            start=self.start,
+            transit=self.transit,
+            duration=self.duration * u.s,
+            interval=self.interval * u.s,
+            frequencies=np.asarray(values) * u.Hz,
+            channel_width=None if width is None else width * u.Hz,
+        )
+
+
+class NoiseTable(Component):
+    """The table [noise]: thermal noise of stations of one `sefd`."""
+
+    sefd: Jansky
+
+
+class CorrectTable(Component):
+    """The table [correct]: `beam = "centre"` takes the beam towards the phase centre out of the visibilities."""
+
+    beam: Literal["centre"] = "centre"
+
+
+class AnalyzeTable(Component):
+    """The table [analyze]: which products, and the settings of forced photometry."""
+
+    products: tuple[Literal["leakage"], ...] = ("leakage",)
+    uv_range: tuple[float, float] | None = None
+    every: int = Field(default=1, ge=1)
+
+    def photometry(self) -> ForcedPhotometry:
+        """The photometry it asks for."""
+        return ForcedPhotometry(uv_range=self.uv_range, every=self.every)
+
+
+class SceneFile(Component):
+    """A scene file: `instrument`, `observation` and `sky`, and the stages that follow; an absent table is left out."""
+
+    name: str
+    title: str = ""
+    seed: int = 0
+    tolerance: float = Field(default=0.0, ge=0)
+    engine: str | None = None
+    instrument: dict[str, Any]
+    observation: ObservationTable
+    sky: dict[str, Any]
+    noise: NoiseTable | None = None
+    correct: CorrectTable | None = None
+    image: Imager | None = None
+    analyze: AnalyzeTable | None = None
+
+    @model_validator(mode="after")
+    def _stages_fit(self) -> Self:
+        if not self.name or any(c in self.name for c in "/\\\0") or self.name.startswith("."):
+            raise InputError(f"name = {self.name!r} cannot name a folder")
+        return self
+
+    def telescope(self) -> Instrument:
+        """The instrument of the table [instrument]."""
+        settings = dict(self.instrument)
+        name = settings.pop("telescope", None)
+        if name is None:
+            raise InputError(f"[instrument] needs 'telescope': one of {', '.join(available('telescopes'))}")
+        for step, (key, cls) in enumerate((("gain", GainTerm), ("feed", FeedTerm)), start=1):
+            if isinstance(settings.get(key), dict):
+                settings[key] = cls(**{"seed": SEED_STEP * self.seed + step, **settings[key]})
+        with _in_table("instrument"):
+            found: Instrument = load("telescopes", name, **settings)
+        return found
+
+    def sky_model(self) -> Sky:
+        """The sky of the table [sky]."""
+        settings = dict(self.sky)
+        kind = settings.pop("kind", None)
+        if kind is None:
+            raise InputError(f"[sky] needs 'kind': one of {', '.join(available('skies'))}")
+        with _in_table("sky"):
+            found: Sky = load("skies", kind, **settings)
+        return found
+
+    def scene(self) -> Scene:
+        """The scene: instrument, sky and observation."""
+        with _in_table("observation"):
+            observation = self.observation.observation()
+        return Scene(name=self.name, instrument=self.telescope(), sky=self.sky_model(), observation=observation)
+
+
+class _in_table:
+    """Says in an error of which table of the scene file it is."""
+
+    def __init__(self, table: str) -> None:
+        self.table = table
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        if isinstance(error, InputError) and not str(error).startswith("["):
+            raise type(error)(f"[{self.table}] {error}") from None
+
+
+def shipped() -> dict[str, str]:
+    """Names of the shipped scenes and their titles."""
+    found = {}
+    for entry in sorted(files("instrument.scenes").iterdir(), key=lambda e: e.name):
+        if entry.name.endswith(".toml"):
+            found[entry.name.removesuffix(".toml")] = tomllib.loads(entry.read_text()).get("title", "")
+    return found
+
+
+def read_tables(scene: str | os.PathLike[str]) -> dict[str, Any]:
+    """Tables of a scene file, or of the shipped scene of that name."""
+    path = Path(scene)
+    if path.suffix == ".toml" or path.exists():
+        if not path.is_file():
+            raise FileError(f"scene file '{path}' does not exist")
+        text, label = path.read_text(encoding="utf-8", errors="replace"), str(path)
+    else:
+        if str(scene) not in shipped():
+            raise InputError(
+                f"no scene is called '{scene}': {did_you_mean(str(scene), shipped())}; or give a .toml file"
+            )
+        text, label = (files("instrument.scenes") / f"{scene}.toml").read_text(), str(scene)
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise FileError(f"{label}: {error}") from None
+
+
+def override(tables: dict[str, Any], settings: Sequence[str]) -> dict[str, Any]:
+    """Tables with settings such as "sky.brightest=500" put in; values are TOML, or else text."""
+    import copy
+
+    out = copy.deepcopy(tables)
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        steps = [s.strip() for s in key.split(".")]
+        if not equals or not all(steps):
+            raise InputError(f"--set {setting}: write it like --set sky.brightest=500")
+        try:
+            value = tomllib.loads(f"value = {text}")["value"]
+        except tomllib.TOMLDecodeError:
+            value = text.strip()
+        table = out
+        for step in steps[:-1]:
+            table = table.setdefault(step, {})
+            if not isinstance(table, dict):
+                raise InputError(f"--set {setting}: '{step}' is not a table")
+        table[steps[-1]] = value
+    return out
+
+
+def parse(tables: dict[str, Any]) -> SceneFile:
+    """Tables as a checked `SceneFile`; raises `InputError` naming the key, the value and the nearest right one."""
+    for name in ("instrument", "observation", "sky"):
+        if name in tables and not isinstance(tables[name], dict):
+            raise InputError(f"'{name}' must be a table, [{name}]")
+    return SceneFile(**tables)
+
+
+def to_toml(tables: dict[str, Any]) -> str:
+    """Tables as TOML text; the inverse of reading them, for what a scene file holds."""
+    import json
+
+    def value(v: Any) -> str:
+        if isinstance(v, bool):
+            return "true" if v else "false"
+        if isinstance(v, str):
+            return json.dumps(v, ensure_ascii=False)
+        if isinstance(v, list):
+            return "[" + ", ".join(value(x) for x in v) + "]"
+        if isinstance(v, dict):
+            return "{ " + ", ".join(f"{k} = {value(x)}" for k, x in v.items()) + " }"
+        return repr(v)
+
+    lines = [f"{k} = {value(v)}" for k, v in tables.items() if not isinstance(v, dict)]
+    for name, table in tables.items():
+        if isinstance(table, dict):
+            lines += ["", f"[{name}]", *(f"{k} = {value(v)}" for k, v in table.items())]
+    return "\n".join(lines) + "\n"
