@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 import warnings
 from collections.abc import Sequence
 from typing import Any
 
-from instrument.errors import InputError, InstrumentError, InstrumentWarning
+from instrument.errors import InputError, InstrumentError, InstrumentWarning, did_you_mean
 
 DONE, FAILED, BAD_INPUT, FELL_SHORT = 0, 1, 2, 3
 
@@ -17,6 +18,9 @@ class _Parser(argparse.ArgumentParser):
     """An argument parser whose errors are one line, with the nearest right word."""
 
     def error(self, message: str) -> Any:
+        wrong = re.search(r"argument VERB: invalid choice: '([^']*)'", message)
+        if wrong:
+            message = f"no verb is called '{wrong[1]}': {did_you_mean(wrong[1], VERBS)}"
         raise InputError(f"{message} (see {self.prog} --help)")
 
 

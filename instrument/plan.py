@@ -412,9 +412,9 @@ def _smearing(problem: Problem) -> list[Item]:
     longest = problem.at.layout.longest_m
     parts = []
     turns = EARTH_RATE * problem.interval_s * longest * float(problem.at.freq_hz.max()) / LIGHT * far
-    parts.append(f"time {1 - np.sinc(turns):.1e}")
+    parts.append(f"time {100 * (1 - np.sinc(turns)):.2g} %")
     if problem.width_hz:
-        parts.append(f"bandwidth {1 - np.sinc(problem.width_hz * longest / LIGHT * far):.1e}")
+        parts.append(f"bandwidth {100 * (1 - np.sinc(problem.width_hz * longest / LIGHT * far)):.2g} %")
     return [Item("smearing", f"{', '.join(parts)} of the farthest source on the longest baseline")]
 
 

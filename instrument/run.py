@@ -86,6 +86,7 @@ def run(
     show(str(plan))
     partial = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
+    made = [p for p in partial.parents if not p.exists()]
     partial.mkdir(parents=True)
     try:
         _compute(result)
@@ -99,6 +100,7 @@ def run(
         partial.rename(folder)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+        _remove_empty(made)
     show(summary(result))
     return result
 
@@ -116,6 +118,13 @@ def _folder(name: str, out: str | None) -> Path:
         count += 1
         folder = Path("runs") / f"{name}-{count}"
     return folder
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    """Take away folders made for a run that left nothing in them."""
+    for folder in folders:
+        if folder.exists() and not any(folder.iterdir()):
+            folder.rmdir()
 
 
 def _compute(result: Result) -> None:

@@ -7,7 +7,7 @@ import tomllib
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -74,7 +74,7 @@ class ObservationTable(Component):
 class NoiseTable(Component):
     """The table [noise]: thermal noise of stations of one `sefd`."""
 
-    sefd: Jansky
+    sefd: Annotated[Jansky, Field(gt=0)]
 
 
 class CorrectTable(Component):
@@ -115,6 +115,8 @@ class SceneFile(Component):
     def _stages_fit(self) -> Self:
         if not self.name or any(c in self.name for c in "/\\\0") or self.name.startswith("."):
             raise InputError(f"name = {self.name!r} cannot name a folder")
+        if self.noise is not None and self.observation.frequency is None and self.observation.channel_width is None:
+            raise InputError("[noise] needs the width of a channel: give channel_width in [observation]")
         return self
 
     def telescope(self) -> Instrument:
@@ -125,7 +127,8 @@ class SceneFile(Component):
             raise InputError(f"[instrument] needs 'telescope': one of {', '.join(available('telescopes'))}")
         for step, (key, cls) in enumerate((("gain", GainTerm), ("feed", FeedTerm)), start=1):
             if isinstance(settings.get(key), dict):
-                settings[key] = cls(**{"seed": SEED_STEP * self.seed + step, **settings[key]})
+                with _in_table(f"instrument.{key}"):
+                    settings[key] = cls(**{"seed": SEED_STEP * self.seed + step, **settings[key]})
         with _in_table("instrument"):
             found: Instrument = load("telescopes", name, **settings)
         return found

@@ -109,7 +109,7 @@ def _read_text_table(file: Path, lines: Sequence[str]) -> PointSky:
         try:
             header = get_header_from_yaml([t[2:] for t in lines if t.startswith("# ")][1:])
         except Exception as error:
-            raise broken(file, None, f"the ECSV header does not parse: {str(error).splitlines()[0]}") from None
+            raise broken(file, None, f"the ECSV header does not parse: {_first_line(error)}") from None
         units = {c["name"]: str(c["unit"]) for c in header["datatype"] if c.get("unit")}
         delimiter = header.get("delimiter", " ")
     numbered = [(n, t) for n, t in enumerate(lines, 1) if t.strip() and not t.startswith("#")]
@@ -134,10 +134,14 @@ def _read_astropy(file: Path, form: str) -> PointSky:
         table = Table.read(file, format=form)
         table.convert_bytestring_to_unicode()
     except Exception as error:  # readers of other people's files fail in many ways
-        raise broken(file, None, f"not a {form} table that astropy reads: {str(error).splitlines()[0]}") from None
+        raise broken(file, None, f"not a {form} table that astropy reads: {_first_line(error)}") from None
     units = {c: str(table[c].unit) for c in table.colnames if table[c].unit is not None}
     values: dict[str, Any] = {c: table[c] for c in table.colnames}
     return _build(file, "row", list(range(1, len(table) + 1)), values, units)
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).splitlines()), type(error).__name__)
 
 
 def _meaning(column: str) -> tuple[str | None, str | None]:
@@ -153,20 +157,21 @@ def _scale(file: Path, column: str, kept: str, unit: str | None, suffix: str | N
     """Factor from the unit of a column to the one its meaning is kept in."""
     from astropy import units as u
 
-    try:
-        if unit is None and suffix is None:
-            if kept not in ("", "rad / m2"):
-                raise broken(file, None, f"column '{column}' has no unit; name it like {_example(column, kept)}")
+    if unit is None and suffix is None:
+        if kept in ("", "rad / m2"):
             return 1.0
-        scale = float(u.Unit(unit or suffix).to(kept))
-        if unit and suffix and not np.isclose(scale, float(u.Unit(suffix).to(kept)), rtol=1e-12):
-            raise broken(file, None, f"column '{column}' is in '{unit}' by its unit but not by its name; rename it")
-    except (ValueError, u.UnitConversionError):
-        name = kept or "no unit"
-        raise broken(
-            file, None, f"column '{column}' is in '{unit or suffix}', which is not convertible to {name}"
-        ) from None
-    return scale
+        raise broken(file, None, f"column '{column}' has no unit; name it like {_example(column, kept)}")
+    scales = []
+    for name in (x for x in (unit, suffix) if x):
+        try:
+            scales.append(float(u.Unit(name).to(kept)))
+        except (ValueError, u.UnitConversionError):
+            wanted = kept or "no unit"
+            message = f"column '{column}' is in '{name}', which is not convertible to {wanted}"
+            raise broken(file, None, message) from None
+    if not np.isclose(scales[0], scales[-1], rtol=1e-12):
+        raise broken(file, None, f"column '{column}' is in '{unit}' by its unit but not by its name; rename it")
+    return scales[0]
 
 
 def _example(column: str, kept: str) -> str:
