@@ -412,9 +412,9 @@ def _smearing(problem: Problem) -> list[Item]:
     longest = problem.at.layout.longest_m
     parts = []
     turns = EARTH_RATE * problem.interval_s * longest * float(problem.at.freq_hz.max()) / LIGHT * far
-    parts.append(f"time {100 * (1 - np.sinc(turns)):.2g} %")
+    parts.append(f"time {100 * (1 - np.sinc(turns)):.3g} %")
     if problem.width_hz:
-        parts.append(f"bandwidth {100 * (1 - np.sinc(problem.width_hz * longest / LIGHT * far)):.2g} %")
+        parts.append(f"bandwidth {100 * (1 - np.sinc(problem.width_hz * longest / LIGHT * far)):.3g} %")
     return [Item("smearing", f"{', '.join(parts)} of the farthest source on the longest baseline")]
 
 

@@ -206,6 +206,7 @@ def record(result: Result, tables: dict[str, Any]) -> dict[str, Any]:
         },
         "seconds": {k: round(v, 3) for k, v in result.seconds.items()},
         "checks": {},
+        "stage_errors": _stage_errors(result),
     }
     if result.check is not None:
         out["checks"]["prediction"] = {
@@ -238,6 +239,19 @@ def record(result: Result, tables: dict[str, Any]) -> dict[str, Any]:
     return out
 
 
+def _stage_errors(result: Result) -> dict[str, str]:
+    """How wrong each stage may be, in words, for the report."""
+    out = {}
+    if result.scene.image is not None and result.cube is not None:
+        out["image"] = f"gridding {result.scene.image.accuracy:.0e} of the image rms asked for"
+    if result.leakage is not None and result.leakage.expected is not None:
+        use = ~result.leakage.near_null
+        gap = np.abs(result.leakage.linear_percent - result.leakage.expected[:, 0])[use]
+        if gap.size:
+            out["expected leakage"] = f"differs from the measured one by {gap.max():.1e} % at most (linear)"
+    return out
+
+
 def _version(package: str) -> str:
     try:
         return version(package)
@@ -255,7 +269,7 @@ def _write(result: Result, tables: dict[str, Any], folder: Path) -> None:
     if result.leakage is not None:
         result.leakage.write(folder / "leakage.ecsv")
     what = record(result, tables)
-    write_report(result, what, folder)
+    write_report(what, result.leakage, result.cube, result.plan.problem.at.centre, folder)
     (folder / "run.json").write_text(json.dumps(what, indent=2), encoding="utf-8")
 
 

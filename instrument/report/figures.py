@@ -69,7 +69,7 @@ def bubbles(leakage: Leakage, centre: Direction | None = None, kind: Kind = "lin
     shown = ~leakage.near_null & np.isfinite(percent)
     top = float(np.percentile(percent[shown], 98)) if shown.any() else 0.0
     top = top if top > 0 else 1.0
-    power = min(0, 3 * int(np.floor(np.log10(top) / 3))) if top < 0.1 else 0
+    power = int(np.floor(np.log10(top))) if top < 0.1 else 0
     values, top = percent / 10.0**power, top / 10.0**power
     unit = "%" if power == 0 else f"× $10^{{{power}}}$ %"
 

@@ -75,12 +75,13 @@ class Table:
 
 @dataclass(frozen=True)
 class FigureEntry:
-    """A PNG file and what it shows: it goes into the page as data, so the page can be moved alone."""
+    """A PNG file and what it shows, put into the page as data; a `wide` one takes the whole width of the page."""
 
     path: str | os.PathLike[str]
     caption: str
     alt: str = ""
-    source: str = ""  # filled in by write_page
+    wide: bool = False
+    source: str = ""  # this and the size are filled in by read
     size: tuple[int, int] = (0, 0)
 
     def read(self) -> FigureEntry:
@@ -187,7 +188,7 @@ def page_of_run(
         verdict = "Done; nothing was checked."
     return Page(
         title=record.get("title") or record.get("name", "run"),
-        subtitle=f"scene {record.get('name', '')}, finished {record.get('finished', '')}",
+        subtitle=f"scene {record.get('name', '')}, finished {record.get('finished', '').replace('T', ' ')}",
         verdict=verdict,
         mark="bad" if short else "good" if record.get("checks") else "",
         cards=_cards(record),
@@ -197,7 +198,7 @@ def page_of_run(
 
 
 def number(value: Any, digits: int = 3) -> str:
-    """A value as text: 3 digits for reals, an en dash for what is not a number, yes or no for truth."""
+    """A value as text: 3 digits for reals (0.400, not 0.4), a dash for what is not a number, yes or no for truth."""
     if value is None or value is np.ma.masked:
         return "–"
     if isinstance(value, bool | np.bool_):
@@ -206,7 +207,9 @@ def number(value: Any, digits: int = 3) -> str:
         real = float(value)
         if not np.isfinite(real):
             return "–" if np.isnan(real) else str(real)
-        plain = f"{real:.{digits}g}"
+        if real == 0 or (abs(real) < 1e6 and real == round(real)):
+            return f"{real:.0f}"
+        plain = f"{real:#.{digits}g}".rstrip(".")
         # 12345 reads better than 1.23e+04
         return f"{real:.0f}" if "e+" in plain and abs(real) < 1e6 else plain
     return str(value)
@@ -237,17 +240,19 @@ def _cards(record: Mapping[str, Any]) -> list[Card]:
     leakage, checks = record.get("leakage", {}), record.get("checks", {})
     if inside := leakage.get("inside_4_deg"):
         null = leakage.get("near_null", 0)
-        note = f"{null} more near a null of the beam, in the whole field" if null else "none near a null of the beam"
-        cards.append(Card("Sources within 4°", str(inside["sources"]), note))
+        note = f"{null} of the whole field near a null, left out" if null else "none near a null of the beam"
+        cards.append(Card("Sources in 4°", str(inside["sources"]), note))
         for kind in ("linear", "circular"):
             median, most = (number(inside[f"{kind}_{what}"]) for what in ("median", "max"))
-            cards.append(Card(f"{kind.capitalize()} leakage within 4°", f"{median} %", f"median; at most {most} %"))
+            cards.append(
+                Card(f"{kind.capitalize()} leakage in 4°", f"{median}\u00a0%", f"median; at most {most}\u00a0%")
+            )
     if check := checks.get("prediction"):
-        note = f"bound {check['bound']:.1e} of the total flux, {number(check['relative_to_jy'], 4)} Jy"
+        note = f"of the {number(check['relative_to_jy'], 4)} Jy in the sky; bound {check['bound']:.1e}"
         cards.append(Card("Prediction error", f"{check['error']:.1e}", note, "good" if check["passed"] else "bad"))
     if "psf_arcmin" in record.get("image", {}):
         major, minor = (number(width) for width in record["image"]["psf_arcmin"])
-        cards.append(Card("PSF", f"{major}′ × {minor}′", "full width at half maximum"))
+        cards.append(Card("PSF", f"{major}′ × {minor}′", "width at half maximum"))
     if seconds := record.get("seconds"):
         parts = [record.get("plan", {}).get("engine"), record.get("machine", {}).get("workers")]
         note = f"engine {parts[0]}, {parts[1]} workers" if all(parts) else ""
@@ -259,7 +264,7 @@ def _rings(leakage: Mapping[str, Any]) -> list[Block]:
     if not leakage.get("rings"):
         return []
     rows = [
-        [f"{number(r['from_deg'])} – {number(r['to_deg'])}", r["sources"]]
+        [f"{r['from_deg']:g} – {r['to_deg']:g}", r["sources"]]
         + [float(r[f"{kind}_{what}"]) for kind in ("linear", "circular") for what in ("median", "max")]
         for r in leakage["rings"]
     ]
@@ -278,7 +283,7 @@ def _checks(record: Mapping[str, Any]) -> list[Block]:
         rows.append([name, found, wanted, _mark(check.get("passed", True))])
         if "flux_in_jy" in check:
             given, seen = check["flux_in_jy"], check["flux_out_jy"]
-            share = f"apparent, {number(100 * seen / given)} %" if given else "apparent"
+            share = f"apparent, {number(100 * seen / given)}\u00a0%" if given else "apparent"
             rows.append(
                 ["flux of all sources", f"{number(seen, 4)} Jy {share}", f"{number(given, 4)} Jy in the sky", ""]
             )
@@ -299,7 +304,7 @@ def _stages(record: Mapping[str, Any]) -> list[Block]:
         wrong.setdefault("photometry", "; ".join(dict.fromkeys(check["outcome"])))
     longest = max(seconds.values()) or 1.0
     rows = [
-        [stage, Cell(duration(spent), bar=spent / longest), wrong.get(stage, "")]
+        [stage, Cell(duration(spent), bar=spent / longest), wrong.get(stage, "–")]
         for stage, spent in sorted(seconds.items(), key=lambda item: -item[1])
     ]
     return [Table(["stage", "time", "how wrong it may be"], rows)]

@@ -185,7 +185,7 @@ class PointSky(Sky):
         """Mean direction of the sources, weighted with |I| (evenly where all I are 0)."""
         weight = np.abs(self.stokes_jy[:, 0])
         x, y, z = (weight if weight.any() else weight + 1) @ self.vectors
-        return Direction(float(np.arctan2(y, x)), float(np.arctan2(z, np.hypot(x, y))))
+        return Direction(float(np.arctan2(y, x) % (2 * np.pi)), float(np.arctan2(z, np.hypot(x, y))))
 
     def distance_rad(self, centre: Direction) -> Float:
         """Angle from a direction, rad (S,)."""

@@ -139,8 +139,8 @@ def test_pairs_stand_beside_an_earlier_source():
     chord = [np.linalg.norm(sky.vectors[:k] - sky.vectors[k], axis=1) for k in moved]
     near = np.rad2deg([c.min() for c in chord]) * 3600
     assert near.max() <= 40.001
-    # a few have a third source that is nearer than the one they were put beside
-    assert np.mean(near < 4.999) < 0.01
+    # nearer than 5 arcsec are only chance meetings around one parent: a third have a sibling, 4 % of those that near
+    assert np.mean(near < 4.999) < 0.03
     np.testing.assert_array_equal(sky.stokes_jy, single.stokes_jy)
 
 

@@ -1,0 +1,133 @@
+"""Forced photometry: fluxes that were put in come out, by either way of solving, and what cannot be measured says so."""
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.coordinates import SkyCoord
+
+import instrument
+from instrument import Analyzer, Observation, Outcome, PointSky, Scene, Towards
+from instrument.analyze.leakage import expected_percent
+from instrument.analyze.photometry import ForcedPhotometry
+
+CENTRE = SkyCoord("08h13m36.0s +48d13m03s")
+STATIONS = ["CS001HBA0", "CS003HBA1", "CS011HBA0", "CS101HBA0", "CS302HBA1", "RS106HBA", "RS205HBA", "RS508HBA"]
+
+
+def night(interval=5 * u.min, frequencies=(150,)):
+    return Observation(
+        phase_centre=CENTRE, transit="2012-12-07", duration=8 * u.hour, interval=interval,
+        frequencies=frequencies * u.MHz, channel_width=0.2 * u.MHz,
+    )  # fmt: skip
+
+
+def polarized(count=30, seed=1, shapes=False, patches=False):
+    rng = np.random.default_rng(seed)
+    where = CENTRE.spherical_offsets_by(rng.uniform(-4, 4, count) * u.deg, rng.uniform(-4, 4, count) * u.deg)
+    flux = rng.normal(size=(count, 4))
+    flux[0] = 1e3, 0, 0, 0  # a bright neighbour
+    extra = {}
+    if shapes:
+        extra = {
+            k: np.where(np.arange(count) < 4, v, 0.0)
+            for k, v in (("major_rad", 2e-5), ("minor_rad", 1e-5), ("angle_rad", 1.0))
+        }
+    if patches:
+        extra["patches"] = ("pair", "pair", *[""] * (count - 2))
+    return PointSky.at(where, flux, **extra)
+
+
+def bare(sky, **observation):
+    array = instrument.load("telescopes", "lofar-hba", beam=None, stations=STATIONS)
+    return Scene(instrument=array, sky=sky, observation=night(**observation)).plan().run()
+
+
+@pytest.mark.parametrize("shapes", [False, True])
+def test_fluxes_come_out_as_they_went_in(shapes):
+    sky = polarized(shapes=shapes)
+    found = ForcedPhotometry(accuracy=1e-12).measure(bare(sky), sky)
+    assert found.outcome == (Outcome.CONVERGED,)
+    # the 1000 Jy neighbour would drown the rest at 1e-2 of itself if its sidelobes were not solved for
+    assert np.abs(found.stokes_jy[0] - sky.stokes_jy).max() < 1e-6
+    assert (found.iterations > 0) == shapes  # the two ways of solving
+
+
+def test_conjugate_gradients_and_the_psf_matrix_agree():
+    sky = polarized()
+    vis = bare(sky)
+    direct = ForcedPhotometry().measure(vis, sky)
+    # weights that differ in nothing but their shape go the other way
+    uneven = np.ones((1, 1, len(vis.antenna1)))
+    uneven[..., 0] = 1 + 1e-9
+    iterated = ForcedPhotometry(accuracy=1e-13).measure(vis.weighted(uneven), sky)
+    assert iterated.iterations > 0
+    assert direct.iterations == 0
+    assert np.abs(direct.stokes_jy - iterated.stokes_jy).max() < 1e-6
+
+
+def test_sources_of_a_patch_are_measured_as_one():
+    sky = polarized(patches=True)
+    sky = sky.with_fields(stokes_jy=np.vstack([[[3, 0, 0, 0], [1, 0, 0, 0]], sky.stokes_jy[2:]]))
+    found = ForcedPhotometry().measure(bare(sky), sky)
+    assert found.names[0] == "pair"
+    assert len(found.names) == len(sky) - 1
+    assert found.stokes_jy[0, 0] == pytest.approx([4, 0, 0, 0], abs=1e-8)
+
+
+def test_flagged_and_nan_data_do_not_enter():
+    sky = polarized()
+    vis = bare(sky)
+    data = np.array(vis.data)
+    data[3, 0, 5] = np.nan
+    data[7, 0, 2] = 1e9
+    flag = np.zeros(data.shape[:3], bool)
+    flag[7, 0, 2] = True
+    found = ForcedPhotometry(accuracy=1e-12).measure(vis.with_data(data).flagged(flag), sky)
+    assert np.abs(found.stokes_jy[0] - sky.stokes_jy).max() < 1e-6
+
+
+def test_what_cannot_be_measured_says_so():
+    sky = polarized(count=3)
+    vis = bare(sky)
+    nothing = ForcedPhotometry().measure(vis.flagged(np.ones((1, 1, 1), bool)), sky)
+    assert nothing.outcome == (Outcome.REFUSED,)
+    assert np.isnan(nothing.stokes_jy).all()
+    twins = sky.select([0, 1, 1])
+    assert ForcedPhotometry().measure(vis, twins).outcome == (Outcome.SINGULAR,)
+
+
+def test_every_nth_integration_gives_the_same_constant_fluxes_in_every_channel():
+    sky = polarized()
+    vis = bare(sky, frequencies=(140, 150))
+    found = ForcedPhotometry(every=7).measure(vis, sky)
+    assert found.stokes_jy.shape == (2, 30, 4)
+    assert np.abs(found.stokes_jy - sky.stokes_jy).max() < 1e-6
+
+
+def test_leakage_of_a_source_alone_is_the_mean_mueller_matrix():
+    sky = PointSky.at(CENTRE.spherical_offsets_by(2 * u.deg, 1.5 * u.deg), [1.0])
+    lofar = instrument.load("telescopes", "lofar-hba", stations=STATIONS)
+    plan = Scene(instrument=lofar, sky=sky, observation=night()).plan()
+    vis = plan.run().corrected(Towards(chain=lofar.chain()))
+    leak = Analyzer(visibilities=vis, sky=sky).leakage()
+    want = expected_percent(lofar.chain(), plan.full.at, sky.stokes_jy)[0]
+    assert leak.linear_percent[0] == pytest.approx(want[0], rel=1e-9)
+    assert leak.circular_percent[0] == pytest.approx(want[1], rel=1e-6)
+    assert 0.1 < want[0] < 2
+
+
+def test_a_source_alone_at_the_centre_has_no_leakage_to_rounding():
+    sky = PointSky.at(CENTRE.reshape(1), [100.0])
+    lofar = instrument.load("telescopes", "lofar-hba", stations=STATIONS)
+    vis = Scene(instrument=lofar, sky=sky, observation=night()).plan().run().corrected(Towards(chain=lofar.chain()))
+    leak = Analyzer(visibilities=vis, sky=sky).leakage()
+    assert leak.linear_percent[0] < 1e-12
+    assert leak.circular_percent[0] < 1e-12
+
+
+def test_a_source_in_a_null_of_the_beam_is_said_to_be_there():
+    where = SkyCoord([CENTRE, CENTRE.spherical_offsets_by(0 * u.deg, 25 * u.deg)])
+    sky = PointSky.at(where, [1.0, 1.0])
+    lofar = instrument.load("telescopes", "lofar-hba", stations=STATIONS)
+    vis = Scene(instrument=lofar, sky=sky, observation=night()).plan().run().corrected(Towards(chain=lofar.chain()))
+    assert Analyzer(visibilities=vis, sky=sky).leakage().near_null.tolist() == [False, True]
