@@ -2,7 +2,7 @@
 
 `check(obj)` returns a `Report`, one line per claim. A claim is a function whose name is the sentence it checks: it
 returns a remark (what was measured) and raises when it does not hold. The claims of Jones terms are in
-`conformance_terms`; what they are evaluated on is in `conformance_bench`.
+`conformance_terms`, those of engines in `conformance_engines`; what they are evaluated on is in `conformance_bench`.
 """
 
 from __future__ import annotations
@@ -15,24 +15,23 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from instrument import conformance_terms, mat2
+from instrument import conformance_engines, conformance_terms, mat2
 from instrument.component import Component
 from instrument.conformance_bench import (
-    ROUNDING,
     Broken,
     bench,
     cuts,
     demand,
     demand_repeatable,
     demand_same,
+    fresh,
     problems,
 )
 from instrument.errors import InputError, InstrumentError, InstrumentWarning
 from instrument.jones.base import JonesTerm
 from instrument.model import Instrument
 from instrument.observe.sampling import Sampling
-from instrument.predict.base import Predictor, Problem
-from instrument.predict.direct import Direct
+from instrument.predict.base import Predictor
 from instrument.sky.base import Sky
 
 
@@ -92,7 +91,7 @@ def check(obj: object, at: Sampling | None = None) -> Report:
 def _line(claim: Callable[..., str], *given: Any, before: str = "", after: str = "") -> Line:
     sentence = before + claim.__name__.replace("_", " ") + after
     try:
-        return Line(sentence, True, claim(*given))
+        return Line(sentence, True, claim(*map(fresh, given)))
     except Broken as error:
         return Line(sentence, False, str(error))
     except Exception as error:  # a stranger's plugin may fail in any way
@@ -105,9 +104,6 @@ def a_round_trip_through_json_gives_an_equal_object(obj: Component, kind: type[C
     demand(type(back) is type(obj), f"it comes back as {type(back).__name__}")
     demand(back == obj, "it comes back unequal")
     return ""
-
-
-# Instruments -----------------------------------------------------------------------------------------------------
 
 
 def its_layout_and_chain_are_the_same_every_time(instrument: Instrument) -> str:
@@ -194,9 +190,6 @@ def _term(term: JonesTerm, at: Sampling | None) -> Iterator[Line]:
     yield _line(a_round_trip_through_json_gives_an_equal_object, term, JonesTerm)
 
 
-# Skies -----------------------------------------------------------------------------------------------------------
-
-
 def about_a_phase_centre_its_directions_are_fixed(sky: Sky, at: Sampling) -> str:
     """`about` changes nothing on the sky, gives the same twice, and what it gives needs no placing any more."""
     before = sky.to_json()
@@ -279,76 +272,17 @@ def _sky(sky: Sky, at: Sampling | None) -> Iterator[Line]:
         yield _line(claim, placed, where.towards(*placed.directions()))
 
 
-# Engines ---------------------------------------------------------------------------------------------------------
-
-
-def it_serves_some_problem_and_refuses_others_in_a_sentence(engine: Predictor, some: dict[str, Problem]) -> str:
-    """`refuses`: `None` for what it serves, else a sentence."""
-    answers = [engine.refuses(problem) for problem in some.values()]
-    demand(None in answers, "it refuses every problem")
-    demand(all(a is None or (isinstance(a, str) and a.strip()) for a in answers), f"it refuses with {answers}")
-    return f"serves {answers.count(None)} of {len(answers)}"
-
-
-def it_agrees_with_direct(engine: Predictor, problem: Problem) -> str:
-    """The same visibilities as the definition, relative to the total flux, for any order and choice of baselines."""
-    back = problem.between(problem.antenna2[::2], problem.antenna1[::2])
-    flux = np.abs(problem.sky.brightness(problem.at)).sum(axis=2).max()
-    errors = [np.abs(engine.sums(p) - Direct().sums(p)).max() / flux for p in (problem, back)]
-    demand(max(errors) <= ROUNDING, f"off by {errors[0]:.1e} of the flux; {errors[1]:.1e} with baselines turned")
-    return f"to {max(errors):.0e} of the flux"
-
-
-def a_block_of_its_sums_equals_the_slice_of_the_whole(engine: Predictor, problem: Problem) -> str:
-    """A run may be cut anywhere."""
-    whole = engine.sums(problem)
-    demand(whole.shape == (*problem.shape, 2, 2), f"shape {whole.shape}, due {(*problem.shape, 2, 2)}")
-    block = engine.sums(problem.block(slice(1, 3), slice(2, 3)))
-    return demand_same(block, whole[1:3, 2:3], "a block of times and channels")
-
-
-def its_work_is_positive_and_grows_with_the_problem(engine: Predictor, problem: Problem) -> str:
-    """Operations, bytes and seconds: finite, above 0, and not less for the whole than for a block."""
-    one, whole = engine.work(problem.block(slice(0, 1), slice(0, 1))), engine.work(problem)
-    for name, small, large in zip(one._fields, one, whole, strict=True):
-        demand(
-            0 < small <= large < np.inf, f"{name}: {small:g} for one time and channel, {large:g} for {problem.shape}"
-        )
-    return f"{whole.flops:.2g} Flop"
-
-
-def its_visibilities_carry_their_coordinates(engine: Predictor, problem: Problem) -> str:
-    """`predict` gives `sums` with antennas, times, channels and interval of the problem."""
-    found = engine.predict(problem)
-    demand_same(found.data, engine.sums(problem), "predict and sums")
-    given = (problem.antenna1, problem.antenna2, problem.at.slots_s, problem.at.freq_hz)
-    kept = (found.antenna1, found.antenna2, found.at.slots_s, found.freq_hz)
-    demand(all(np.array_equal(x, y) for x, y in zip(given, kept, strict=True)), "its coordinates are others")
-    demand(found.interval_s == problem.interval_s and found.width_hz == problem.width_hz, "interval or width differ")
-    return ""
-
-
-def a_call_of_its_sums_has_no_side_effects(engine: Predictor, problem: Problem) -> str:
-    """The same call twice gives the same, and nothing that was given has changed."""
-    return demand_repeatable(lambda: engine.sums(problem), engine, problem)
-
-
 def _engine(engine: Predictor, at: Sampling | None) -> Iterator[Line]:
     some = problems()
-    first = _line(it_serves_some_problem_and_refuses_others_in_a_sentence, engine, some)
+    first = _line(conformance_engines.it_serves_some_problem_and_refuses_others_in_a_sentence, engine, some)
     yield first
     yield _line(a_round_trip_through_json_gives_an_equal_object, engine, Predictor)
     if not first.passed:
         return
     served = {name: problem for name, problem in some.items() if engine.refuses(problem) is None}
     for name, problem in served.items():
-        yield _line(it_agrees_with_direct, engine, problem, after=f": {name}")
-    for claim in (
-        a_block_of_its_sums_equals_the_slice_of_the_whole,
-        its_work_is_positive_and_grows_with_the_problem,
-        its_visibilities_carry_their_coordinates,
-        a_call_of_its_sums_has_no_side_effects,
-    ):
+        yield _line(conformance_engines.it_agrees_with_direct, engine, problem, after=f": {name}")
+    for claim in conformance_engines.CLAIMS:
         yield _line(claim, engine, list(served.values())[-1])
 
 

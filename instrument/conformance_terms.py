@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import reduce
+from itertools import pairwise
 from typing import get_args
 
 import numpy as np
@@ -125,7 +126,7 @@ def its_parts_multiply_to_its_jones(term: JonesTerm, at: Sampling) -> str:
     """`parts()`: their product, receiver to sky, is the term, and their bases meet."""
     parts = term.parts()
     demand(parts, "it has no part")
-    meet = all(left.maps[0] == right.maps[1] for left, right in zip(parts[:-1], parts[1:], strict=True))
+    meet = all(left.maps[0] == right.maps[1] for left, right in pairwise(parts))
     ends = (parts[-1].maps[0], parts[0].maps[1])
     demand(meet and ends == term.maps, f"the bases of the parts give {ends}, the term {term.maps}")
     product = reduce(mat2.mul, (part.jones(at) for part in parts))

@@ -86,7 +86,7 @@ def _version(name: str) -> str:
 
 
 def _memory_gb() -> float:
-    from instrument.plan import machine_memory
+    from instrument.planner import machine_memory
 
     return machine_memory() / 1e9
 

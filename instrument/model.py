@@ -43,8 +43,8 @@ class Instrument(Component):
         """Jones terms, receiver to sky."""
 
     def receivers(self) -> tuple[JonesTerm, ...]:
-        """The direction-independent terms that are there, for the left end of a chain."""
-        return tuple(t for t in (self.gain, self.feed) if t is not None)
+        """Gains and feed errors, for the left end of a chain; the identity where none are given."""
+        return self.gain or GainTerm(), self.feed or FeedTerm()
 
     def beam(
         self, directions: Any, times: Any, frequencies: Any, pointing: Any = None, state: State = "absolute"
@@ -60,9 +60,10 @@ class Instrument(Component):
             raise InputError(f"state = '{state}' is not a state of a beam: 'absolute' or 'differential'")
         at = self.sampling(directions, times, frequencies, pointing)
         warn_outside_band(self.chain(), at.freq_hz)
-        found = self.chain().jones(at)
+        chain, _ = self.chain().simplified(at)
+        found = chain.jones(at)
         if state == "differential":
-            centre = mat2.inverse(self.chain().jones(at.at_centre()))
+            centre = mat2.inverse(chain.jones(at.at_centre()))
             if not np.all(np.isfinite(centre)):
                 raise InputError(
                     "the beam at the pointing is singular (below the horizon?): it has no differential beam"

@@ -9,7 +9,8 @@ from pydantic import SerializeAsAny
 from instrument.component import Component
 from instrument.model import Instrument
 from instrument.observe.observation import Observation
-from instrument.plan import Plan, make_plan
+from instrument.plan import Plan
+from instrument.planner import make_plan
 from instrument.sky.base import Sky
 
 
@@ -22,13 +23,19 @@ class Scene(Component):
     observation: Observation
 
     def plan(
-        self, tolerance: float = 0.0, engine: str | None = None, memory: Any = None, workers: int | None = None
+        self,
+        tolerance: float = 0.0,
+        engine: str | None = None,
+        memory: Any = None,
+        workers: int | None = None,
+        uv_range: tuple[float, float] | None = None,
     ) -> Plan:
         """What is kept, what is left out and why, by which engine, at what cost and error bound.
 
         `tolerance` bounds the error that may be made, relative to the total flux of the sky (0: exact omissions only);
         `engine` names one instead of the cheapest; `memory` ("8 GB") is the most the run may take, three quarters of
-        the machine by default; `workers` the number of threads. Raises `InputError` for impossible scenes and
+        the machine by default; `workers` the number of threads; `uv_range` (wavelengths) is
+        all that is asked for: baselines never within it are left out. Raises `InputError` for impossible scenes and
         `RefusedError` when no engine or not enough memory serves.
         """
         return make_plan(
@@ -40,4 +47,5 @@ class Scene(Component):
             engine=engine,
             memory=memory,
             workers=workers,
+            uv_range=uv_range,
         )

@@ -56,6 +56,17 @@ class JonesTerm(Component):
         """The terms this one is the product of, receiver to sky; itself unless it is a composite."""
         return (self,)
 
+    def peak(self, at: Sampling) -> float:
+        """A bound on the largest singular value of the term at any time, station and direction; infinity if unknown."""
+        return float("inf")
+
+    def sharing(self, at: Sampling) -> str:
+        """How many different matrices the stations of an array need of this term, in words."""
+        if self.per_station == "own":
+            return f"{type(self).__name__} one per station"
+        sizes = [len(at.layout)] if self.per_station == "shared" else np.bincount(at.layout.frames[1])
+        return f"{type(self).__name__} shared by {'+'.join(str(n) for n in sorted(sizes, reverse=True))} stations"
+
     def simplify(self, at: Sampling, tolerance: float) -> Simplified:
         """What a scene needs of this term: itself, something simpler, or nothing, with a bound on the error."""
         return Simplified(self, "", 0.0)

@@ -12,7 +12,7 @@ from pydantic import SerializeAsAny, model_validator
 from instrument import mat2
 from instrument.component import Component
 from instrument.errors import BasisError
-from instrument.jones.base import JonesTerm, Structure
+from instrument.jones.base import JonesTerm, Simplified, Structure
 from instrument.observe.sampling import Sampling
 from instrument.units import Complex, Int
 
@@ -76,6 +76,15 @@ class Chain(Component):
         """Number G of different shared matrices for the stations of `layout`."""
         kinds = {t.per_station for t in self._shared_terms()}
         return len(layout) if "own" in kinds else len(layout.frames[0]) if "frame" in kinds else 1
+
+    def peak(self, at: Sampling) -> float:
+        """A bound on the largest singular value of the product anywhere; infinity where a term knows none."""
+        return float(np.prod([t.peak(at) for t in self.parts]))
+
+    def simplified(self, at: Sampling, tolerance: float = 0.0) -> tuple[Chain, list[tuple[JonesTerm, Simplified]]]:
+        """What a scene needs of the chain, and what became of each term."""
+        fates = [(term, term.simplify(at, tolerance)) for term in self.terms]
+        return Chain(*(fate.term for _, fate in fates if fate.term is not None)), fates
 
     def beams(self) -> Chain:
         """The terms that differ between directions: the chain without its direction-independent left end."""

@@ -22,6 +22,10 @@ class Parallactic(JonesTerm):
     maps: ClassVar[tuple[Basis, Basis]] = ("sky", "horizon")
     per_station: ClassVar[PerStation] = "frame"
 
+    def peak(self, at: Sampling) -> float:
+        """1: it is a rotation and a change of handedness."""
+        return 1.0
+
     def jones(self, at: Sampling) -> Complex:
         """The rotation, (T, 1, A, S, 2, 2)."""
         d, east = at.itrf, at.east_itrf

@@ -70,6 +70,14 @@ class ArrayFactor(ScalarTerm):
             out = out * factor.reshape(times, channels, -1, sources)[:, :, which]
         return np.asarray(out)
 
+    def peak(self, at: Sampling) -> float:
+        """1: a mean of unit vectors."""
+        return 1.0
+
+    def sharing(self, at: Sampling) -> str:
+        """How many different array factors there are."""
+        return f"{self.distinct_count} array factors"
+
     @property
     def distinct_count(self) -> int:
         """How many different array factors the stations have between them."""
@@ -99,6 +107,10 @@ class StationBeam(JonesTerm):
     def parts(self) -> tuple[JonesTerm, ...]:
         """(ArrayFactor, element)."""
         return (self.array, *self.element.parts())
+
+    def peak(self, at: Sampling) -> float:
+        """That of the element: an array factor is at most 1."""
+        return self.element.peak(at)
 
     def jones(self, at: Sampling) -> Complex:
         """Array factor times element, (T, F, A, S, 2, 2)."""

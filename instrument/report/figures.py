@@ -76,12 +76,18 @@ def bubbles(leakage: Leakage, centre: Direction | None = None, kind: Kind = "lin
     reach = 1.08 * max(float(np.abs([east, north]).max(initial=0)), 1e-3)
     ax.set(xlim=(reach, -reach), ylim=(-reach, reach), aspect="equal")
     ax.set(xlabel="offset east (deg)", ylabel="offset north (deg)", title=f"{kind.capitalize()} leakage")
+    crowd = len(east) > 500
+    above = 3 if crowd else 0  # circles would drown below a crowd of sources
     for radius in (2, 4):
-        ax.add_patch(Circle((0, 0), radius, fill=False, color=GREY, lw=1, ls=(0, (4, 3)), zorder=1))
+        ax.add_patch(
+            Circle((0, 0), radius, fill=False, color=INK if crowd else GREY, lw=1, ls=(0, (4, 3)), zorder=1 + above)
+        )
         if radius < reach:
             box = {"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none"}
             x, y = _clearest(radius, east, north)
-            ax.text(x, y, f"{radius}°", color="#555555", size=11, ha="center", va="center", bbox=box, zorder=1.5)
+            ax.text(
+                x, y, f"{radius}°", color="#555555", size=11, ha="center", va="center", bbox=box, zorder=1.5 + above
+            )
 
     # bubbles of a full grid just touch; a crowd of sources gets small ones
     widest = float(np.clip(300 / np.sqrt(max(len(east), 1)), 6, 24))
@@ -103,9 +109,12 @@ def bubbles(leakage: Leakage, centre: Direction | None = None, kind: Kind = "lin
     )
     drawn.set_label("measured")
     lost = ~shown
-    ax.scatter(east[lost], north[lost], s=16, marker="x", color=GREY, lw=0.9, zorder=2, label="near a null")
-    above = bool((values[shown] > top).any())
-    bar = ax.figure.colorbar(drawn, ax=ax, fraction=0.045, pad=0.02, extend="max" if above else "neither")
+    ax.scatter(
+        east[lost], north[lost], s=min(16, widest**2 / 4), marker="x", color=GREY, lw=0.9, zorder=2, label="near a null"
+    )
+    bar = ax.figure.colorbar(
+        drawn, ax=ax, fraction=0.045, pad=0.02, extend="max" if (values[shown] > top).any() else "neither"
+    )
     bar.set_label(f"leakage ({unit.removeprefix('× ')} of I)", labelpad=8)
     bar.locator = MaxNLocator(5)
     bar.update_ticks()
@@ -143,7 +152,7 @@ def profile(leakage: Leakage, ax: Axes | None = None) -> Axes:
         values = measured[name]
         low = values < floor
         below += int(low.sum())
-        ax.scatter(distance[~low], values[~low], s=13, color=colour, lw=0, zorder=3)
+        ax.scatter(distance[~low], values[~low], s=13 if len(values) < 500 else 4, color=colour, lw=0, zorder=3)
         edge = np.full(int(low.sum()), floor * 1.15)
         ax.scatter(distance[low], edge, s=34, marker="v", color=colour, lw=0, zorder=3, clip_on=False)
         if leakage.expected is not None:
@@ -153,7 +162,7 @@ def profile(leakage: Leakage, ax: Axes | None = None) -> Axes:
         for start in np.unique(ring):
             inside = values[(ring == start) & np.isfinite(values)]
             if len(inside) and np.median(inside) >= floor:
-                ax.plot([start, start + 1], [np.median(inside)] * 2, color=colour, lw=3.5, alpha=0.55, zorder=1)
+                ax.plot([start, start + 1], [np.median(inside)] * 2, color=INK, lw=2, zorder=4)
     ax.set(yscale="log", ylim=(floor, top), xlim=(0, max(float(distance.max(initial=0)) * 1.04, 1e-3)))
     ax.set(xlabel="distance from the phase centre (deg)", ylabel="leakage (% of I)", title="Leakage against distance")
     ax.grid(color="#dddddd", lw=0.6)
@@ -164,7 +173,7 @@ def profile(leakage: Leakage, ax: Axes | None = None) -> Axes:
     ]
     if leakage.expected is not None:
         keys.append(Line2D([], [], ls="", marker="o", ms=7, mfc="none", mec=INK, mew=0.8, label="from the beam model"))
-    keys.append(Line2D([], [], color=INK, lw=3.5, alpha=0.55, label="median of each degree"))
+    keys.append(Line2D([], [], color=INK, lw=2, label="median of each degree"))
     if below:
         keys.append(Line2D([], [], ls="", marker="v", ms=6, color=INK, label=f"below the axis ({below})"))
     if not use.all():

@@ -151,14 +151,15 @@ def lines_of(path: Path, text: Sequence[str]) -> list[Line]:
             given = split(raw)
         except ValueError as error:
             raise broken(path, number, str(error)) from None
-        if any(given[len(fields) :]):
-            raise broken(path, number, f"{len(given)} values for the {len(fields)} fields of the format line")
-        values = {}
-        for k, (name, default, fixed) in enumerate(fields):
-            value = given[k] if k < len(given) else ""
+        places = sum(fixed is None for _, _, fixed in fields)
+        if any(given[places:]):
+            raise broken(path, number, f"{len(given)} values for the {places} fields of the format line")
+        values, rest = {}, iter(given)
+        for name, default, fixed in fields:
+            value = next(rest, "") if fixed is None else fixed  # a fixed value has no place in the line, as in DP3
             if len(value) > 1 and value[0] in "'\"" and value[0] == value[-1]:
                 value = value[1:-1].strip()
-            values[name] = fixed if fixed is not None else value or default or ""
+            values[name] = value or default or ""
         found.append(Line(path, number, values))
     return found
 

@@ -25,6 +25,10 @@ class CrossedDipole(ElementBeam):
     height: Annotated[Metres, Field(gt=0)]
     x_azimuth: Radians = 0.0
 
+    def peak(self, at: Sampling) -> float:
+        """1."""
+        return 1.0
+
     def jones(self, at: Sampling) -> Complex:
         """J of the element, (T, F, A, S, 2, 2)."""
         theta = at.zenith_angle

@@ -29,6 +29,10 @@ class Airy(ElementBeam):
     structure: ClassVar[Structure] = "scalar"
     diameter: Annotated[Metres, Field(gt=0)]
 
+    def peak(self, at: Sampling) -> float:
+        """1."""
+        return 1.0
+
     def jones(self, at: Sampling) -> Complex:
         """J of the dish, (T, F, A, S, 2, 2)."""
         from scipy.special import j1
@@ -48,6 +52,10 @@ class Gaussian(ElementBeam):
     structure: ClassVar[Structure] = "scalar"
     fwhm: Annotated[Radians, Field(gt=0)]
     frequency: Hertz | None = None
+
+    def peak(self, at: Sampling) -> float:
+        """1."""
+        return 1.0
 
     def jones(self, at: Sampling) -> Complex:
         """J of the dish, (T, F, A, S, 2, 2)."""

@@ -32,23 +32,32 @@ class Hamaker(ElementBeam):
         _, centre, width = coefficients(self.band)
         return centre - width, centre + width
 
+    def peak(self, at: Sampling) -> float:
+        """Sum over harmonics of the larger of |p_theta|, |p_phi|, at its highest between zenith and horizon."""
+        theta = np.linspace(0, np.pi / 2, 2001)[None, None, None]
+        bound = sum(np.maximum(np.abs(t), np.abs(f)) for t, f in self._patterns(self._folded(at.freq_hz), theta))
+        return 1.001 * float(np.max(bound))  # between the points of the grid it changes by less than 1e-3
+
     def jones(self, at: Sampling) -> Complex:
         """J of the element, (T, F, A, S, 2, 2)."""
-        table, f0, df = coefficients(self.band)
-        x = (at.freq_hz - f0) / df
-        # (k, i, F, d): the polynomial in frequency folded once per channel
-        folded = np.einsum("kijd,fj->kifd", table, x[:, None] ** np.arange(table.shape[2]))
+        folded = self._folded(at.freq_hz)
         theta = at.zenith_angle[:, None]
         cos_az, sin_az = at.azimuth_cos_sin
         c, s = np.cos(X_AZIMUTH), np.sin(X_AZIMUTH)
         cos_phi, sin_phi = (cos_az * c + sin_az * s)[:, None], (sin_az * c - cos_az * s)[:, None]
-        out = np.zeros((theta.shape[0], len(x), *theta.shape[2:], 2, 2), complex)
+        out = np.zeros((theta.shape[0], len(at.freq_hz), *theta.shape[2:], 2, 2), complex)
         for k, (p_theta, p_phi) in enumerate(self._patterns(folded, theta)):
             cos_a, sin_a = _multiple(cos_phi, sin_phi, 2 * k + 1)
             sin_a = -sin_a if k % 2 else sin_a
             out += pack(cos_a * p_theta, -sin_a * p_phi, sin_a * p_theta, cos_a * p_phi)
         out *= (theta < np.pi / 2)[..., None, None]
         return out
+
+    def _folded(self, freq_hz: Float) -> Complex:
+        """The polynomials in theta of each channel, (k, i, F, d): those in frequency folded once."""
+        table, f0, df = coefficients(self.band)
+        x = (freq_hz - f0) / df
+        return np.asarray(np.einsum("kijd,fj->kifd", table, x[:, None] ** np.arange(table.shape[2])))
 
     @staticmethod
     def _patterns(folded: Complex, theta: Float) -> list[list[Complex]]:

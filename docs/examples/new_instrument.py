@@ -1,0 +1,42 @@
+"""A new instrument: tiles of 4 x 4 crossed dipoles on a ring. The same class as in docs/extending.md."""
+
+from typing import Annotated
+
+import numpy as np
+from astropy import units as u
+from pydantic import Field, SerializeAsAny
+
+import instrument
+from instrument import Chain, ElementBeam, Instrument, Layout, Level, Parallactic, StationBeam
+from instrument.units import Metres
+from instrument_plugins.elements.dipole import CrossedDipole
+
+SITE = {"longitude_rad": np.deg2rad(116.67), "latitude_rad": np.deg2rad(-26.7), "height_m": 377.0}
+
+
+class Ring(Instrument):
+    """Tiles of 4 x 4 dipoles, evenly spaced on a ring."""
+
+    count: Annotated[int, Field(ge=2)] = 8
+    radius: Metres = 200.0
+    pitch: Metres = 1.1
+    element: SerializeAsAny[ElementBeam] = CrossedDipole(height=0.3 * u.m)
+
+    def layout(self):
+        """Stations, from offsets east, north and up of the site."""
+        angle = 2 * np.pi * np.arange(self.count) / self.count
+        enu = self.radius * np.stack([np.sin(angle), np.cos(angle), 0 * angle], axis=-1)
+        return Layout.from_enu([f"tile{k}" for k in range(self.count)], enu, **SITE)
+
+    def chain(self):
+        """Gains and feeds if given, the tile, the parallactic rotation."""
+        steps = self.pitch * (np.arange(4) - 1.5)
+        p, q = (x.ravel() for x in np.meshgrid(steps, steps))
+        dipoles = np.stack([p, q, 0 * p], axis=-1) @ self.layout().axes[0]  # local axes to ITRF
+        tile = Level(offsets_m=dipoles[None])  # one layout for all stations: (1, 16, 3)
+        return Chain(*self.receivers(), StationBeam(element=self.element, levels=(tile,)), Parallactic())
+
+
+if __name__ == "__main__":
+    ring = Ring(radius="150 m")
+    print(instrument.conformance.check(ring))
