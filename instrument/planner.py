@@ -251,10 +251,14 @@ def _smearing(problem: Problem) -> list[Item]:
     longest = problem.at.layout.longest_m
     parts = []
     turns = EARTH_RATE * problem.interval_s * longest * float(problem.at.freq_hz.max()) / LIGHT * far
-    parts.append(f"time {100 * (1 - np.sinc(turns)):.3g} %")
+    parts.append(f"time {_percent(1 - np.sinc(turns))}")
     if problem.width_hz:
-        parts.append(f"bandwidth {100 * (1 - np.sinc(problem.width_hz * longest / LIGHT * far)):.3g} %")
-    return [Item("smearing", f"{', '.join(parts)} of the farthest source on the longest baseline")]
+        parts.append(f"bandwidth {_percent(1 - np.sinc(problem.width_hz * longest / LIGHT * far))}")
+    return [Item("smearing", f"{', '.join(parts)} of the farthest source lost on the longest baseline")]
+
+
+def _percent(lost: float) -> str:
+    return "all" if lost >= 0.995 else f"{100 * lost:.2g} %"
 
 
 def _rounding(problem: Problem) -> float:

@@ -2,14 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from instrument.analyze.leakage import Leakage
 from instrument.image.cube import StokesCube
-from instrument.report.figures import bubbles, profile, psf_image, save, stokes_images
-from instrument.report.page import FigureEntry, page_of_run, write_page
+from instrument.report.figures import Kind, bubbles, profile
+from instrument.report.images import psf_image, stokes_images
+from instrument.report.page import (
+    Block,
+    Card,
+    Cell,
+    Details,
+    FigureEntry,
+    Figures,
+    Page,
+    Section,
+    Table,
+    Text,
+    duration,
+    number,
+    write_page,
+)
+from instrument.report.style import save
 from instrument.units import Direction
+
+PLANES: tuple[tuple[Kind, str], ...] = (("linear", "linear polarization"), ("circular", "circular polarization"))
 
 
 def write_report(
@@ -18,14 +37,14 @@ def write_report(
     """Draw the figures of a run into its folder and write `report.html`; `record` is what `run.json` holds."""
     entries: list[FigureEntry] = []
 
-    def draw(name: str, drawing: Any, caption: str) -> None:
-        entries.append(FigureEntry(save(drawing, folder / f"{name}.png"), caption))
+    def draw(name: str, drawing: Any, caption: str, wide: bool = False) -> None:
+        entries.append(FigureEntry(save(drawing, folder / f"{name}.png"), caption, wide=wide))
 
     if leakage is not None:
-        for kind, what in (("linear", "linear polarization"), ("circular", "circular polarization")):
+        for kind, what in PLANES:
             draw(
                 f"leakage_{kind}",
-                bubbles(leakage, centre, kind),  # type: ignore[arg-type]
+                bubbles(leakage, centre, kind),
                 f"Leakage of Stokes I into {what}, source by source: size and colour are its percentage of the "
                 "apparent I. Circles at 2 and 4 deg from the phase centre.",
             )
@@ -36,8 +55,137 @@ def write_report(
             "baselines and times.",
         )
     if cube is not None:
-        draw("images", stokes_images(cube), "Dirty images of the four Stokes parameters.")
         if cube.psf is not None:
             draw("psf", psf_image(cube), "Point spread function and the Gaussian fitted to its main lobe.")
+        draw("images", stokes_images(cube), "Dirty images of the four Stokes parameters.", wide=True)
     sources = None if leakage is None else leakage.table()
     write_page(page_of_run(record, entries, sources), folder / "report.html")
+
+
+def page_of_run(
+    record: Mapping[str, Any],
+    figures: Iterable[FigureEntry] = (),
+    sources: Any = None,
+    more: Iterable[Section] = (),
+) -> Page:
+    """The page of a run from what `run.json` holds; a part that is absent there is absent here.
+
+    `sources` is an astropy table of all sources, `more` are sections of other stages, put after the figures. Read are
+    name, title, finished, seed, versions, machine, plan (text, engine), seconds, checks, leakage, image, and where
+    given command and stage_errors (stage -> how wrong it may be).
+    """
+    plan = record.get("plan", {})
+    sections = [
+        Section("Plan", [Text("\n".join(plan.get("text", ())), code=True)] if plan.get("text") else []),
+        Section("Leakage by distance", _rings(record.get("leakage", {}))),
+        Section("Figures", [Figures(entries)] if (entries := list(figures)) else []),
+        *more,
+        Section("Checks", _checks(record)),
+        Section("What each stage cost, and how wrong it may be", _stages(record)),
+        Section("All sources", [_all_sources(sources)] if sources is not None else []),
+        Section("To run it again", _again(record)),
+    ]
+    short = [name for name, check in record.get("checks", {}).items() if not check.get("passed", True)]
+    verdict = f"Done, but fell short: {', '.join(short)}." if short else "Done; every check held."
+    if not record.get("checks"):
+        verdict = "Done; nothing was checked."
+    return Page(
+        title=record.get("title") or record.get("name", "run"),
+        subtitle=f"scene {record.get('name', '')}, finished {record.get('finished', '').replace('T', ' ')}",
+        verdict=verdict,
+        mark="bad" if short else "good" if record.get("checks") else "",
+        cards=_cards(record),
+        sections=[section for section in sections if section.blocks],
+        footer=f"instrument {record.get('versions', {}).get('instrument', '')}",
+    )
+
+
+def _mark(passed: bool, good: str = "held", bad: str = "fell short") -> Cell:
+    return Cell(good if passed else bad, mark="good" if passed else "bad")
+
+
+def _cards(record: Mapping[str, Any]) -> list[Card]:
+    cards = []
+    leakage, checks = record.get("leakage", {}), record.get("checks", {})
+    if inside := leakage.get("inside_4_deg"):
+        null = leakage.get("near_null", 0)
+        note = f"{null} of the whole field near a null, left out" if null else "none near a null of the beam"
+        cards.append(Card("Sources in 4°", str(inside["sources"]), note))
+        for kind in ("linear", "circular"):
+            median, most = (number(inside[f"{kind}_{what}"]) for what in ("median", "max"))
+            cards.append(
+                Card(f"{kind.capitalize()} leakage in 4°", f"{median}\u00a0%", f"median; at most {most}\u00a0%")
+            )
+    if check := checks.get("prediction"):
+        note = f"of the {number(check['relative_to_jy'], 4)} Jy in the sky; bound {check['bound']:.1e}"
+        cards.append(Card("Prediction error", f"{check['error']:.1e}", note, "good" if check["passed"] else "bad"))
+    if "psf_arcmin" in record.get("image", {}):
+        major, minor = (number(width) for width in record["image"]["psf_arcmin"])
+        cards.append(Card("PSF", f"{major}′ × {minor}′", "width at half maximum"))
+    if seconds := record.get("seconds"):
+        parts = [record.get("plan", {}).get("engine"), record.get("machine", {}).get("workers")]
+        note = f"engine {parts[0]}, {parts[1]} workers" if all(parts) else ""
+        cards.append(Card("Wall time", duration(sum(seconds.values())), note))
+    return cards
+
+
+def _rings(leakage: Mapping[str, Any]) -> list[Block]:
+    if not leakage.get("rings"):
+        return []
+    rows = [
+        [f"{r['from_deg']:g} – {r['to_deg']:g}", r["sources"]]
+        + [float(r[f"{kind}_{what}"]) for kind in ("linear", "circular") for what in ("median", "max")]
+        for r in leakage["rings"]
+    ]
+    heads = ["distance (deg)", "sources", "I→P median (%)", "I→P max (%)", "I→V median (%)", "I→V max (%)"]
+    return [Table(heads, rows, "P is sqrt(Q² + U²); both in % of the apparent I of the source.")]
+
+
+def _checks(record: Mapping[str, Any]) -> list[Block]:
+    rows: list[list[Any]] = []
+    for name, check in record.get("checks", {}).items():
+        if name == "prediction":
+            found, wanted = f"error {check['error']:.1e}", f"at most {check['bound']:.1e}"
+            name = f"prediction, {check['samples']} visibilities against the definition"
+        else:
+            found, wanted = "; ".join(dict.fromkeys(check.get("outcome", ()))), ""
+        rows.append([name, found, wanted, _mark(check.get("passed", True))])
+        if "flux_in_jy" in check:
+            given, seen = check["flux_in_jy"], check["flux_out_jy"]
+            share = f"apparent, {number(100 * seen / given)}\u00a0%" if given else "apparent"
+            rows.append(
+                ["flux of all sources", f"{number(seen, 4)} Jy {share}", f"{number(given, 4)} Jy in the sky", ""]
+            )
+    if image := record.get("image"):
+        for stokes, rms in image.get("rms", {}).items():
+            rows.append([f"rms of the {stokes} image", f"{number(float(rms))} {image['unit']}", "", ""])
+    return [Table(["check", "found", "expected", "verdict"], rows)] if rows else []
+
+
+def _stages(record: Mapping[str, Any]) -> list[Block]:
+    seconds, checks = record.get("seconds", {}), record.get("checks", {})
+    if not seconds:
+        return []
+    wrong = dict(record.get("stage_errors", {}))
+    if check := checks.get("prediction"):
+        wrong.setdefault("predict", f"{check['error']:.1e} measured, {check['bound']:.1e} at most, of the total flux")
+    if check := checks.get("photometry"):
+        wrong.setdefault("photometry", "; ".join(dict.fromkeys(check["outcome"])))
+    longest = max(seconds.values()) or 1.0
+    rows = [
+        [stage, Cell(duration(spent), bar=spent / longest), wrong.get(stage, "–")]
+        for stage, spent in sorted(seconds.items(), key=lambda item: -item[1])
+    ]
+    return [Table(["stage", "time", "how wrong it may be"], rows)]
+
+
+def _all_sources(sources: Any) -> Details:
+    return Details(f"{len(sources)} sources", [Table.of(sources)])
+
+
+def _again(record: Mapping[str, Any]) -> list[Block]:
+    blocks: list[Block] = [Text(record.get("command", "instrument run scene.toml"), code=True)]
+    rows = [["seed", number(record.get("seed"))]]
+    rows += [[name, str(value)] for name, value in record.get("machine", {}).items()]
+    rows += [[name, str(value)] for name, value in record.get("versions", {}).items()]
+    return [Details("Command, seed, versions", [*blocks, Table(["what", "value"], rows)])]

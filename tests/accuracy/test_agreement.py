@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 from astropy import units as u
+from instrument_plugins.elements.dipole import CrossedDipole
+from instrument_plugins.elements.dish import Airy
 
 import instrument
 from instrument import Chain, Composed, FeedTerm, GainTerm, Layout, Observation, Parallactic, PointSky, Scene
 from instrument.observe.directions import offset
 from instrument.units import Direction
-from instrument_plugins.elements.dipole import CrossedDipole
-from instrument_plugins.elements.dish import Airy
 
 CENTRE = Direction(2.15, 0.84)
 STATIONS = ["CS001HBA0", "CS002HBA1", "CS302HBA0", "RS106HBA", "RS406HBA", "RS508HBA"]

@@ -1,4 +1,4 @@
-"""Forced photometry: fluxes that were put in come out, by either way of solving, and what cannot be measured says so."""
+"""Forced photometry: fluxes that were put in come out, by either way of solving; what cannot be measured says so."""
 
 import numpy as np
 import pytest

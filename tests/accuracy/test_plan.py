@@ -1,4 +1,4 @@
-"""The plan: what is left out is exactly or provably nothing, its bound holds, its memory is a promise, any executor runs it."""
+"""The plan: what is left out is provably nothing, its bound holds, its memory is a promise, any executor runs it."""
 
 import tracemalloc
 from concurrent.futures import ProcessPoolExecutor
@@ -195,7 +195,7 @@ def test_impossible_scenes_are_refused_before_anything_runs():
                 duration=1 * u.hour,
                 interval=10 * u.min,
                 frequencies=[150] * u.MHz,
-            ),  # fmt: skip
+            ),
         ).plan()
     with pytest.raises(InputError, match="empty"):
         PointSky(names=(), ra_rad=[], dec_rad=[], stokes_jy=np.zeros((0, 4)))

@@ -1,18 +1,18 @@
 """The LOFAR HBA beam against the published table, an independent evaluation, and the paper's figures."""
 
+import instrument_plugins.data as data
 import numpy as np
 import pytest
 from astropy import units as u
 from astropy.coordinates import SkyCoord
 from astropy.table import Table
+from instrument_plugins.elements.hamaker import Hamaker
 from scipy.optimize import least_squares
 
 import instrument
-import instrument_plugins.data as data
 from instrument import Observation, Sampling
 from instrument.jones.mueller import di_errors, ixr_jones, ixr_mueller, leakage, mueller
 from instrument.observe.directions import offset
-from instrument_plugins.elements.hamaker import Hamaker
 
 CENTRE = SkyCoord("08h13m36.0s +48d13m03s")
 PAIR = ["CS001HBA0", "CS001HBA1"]
@@ -66,7 +66,7 @@ def test_hamaker_element_is_its_coefficient_table(band):
     [(120, 5.08, 4.81), (150, 4.07, 3.85), (180, 3.39, 3.21)],
 )
 def test_main_beam_is_as_wide_as_published(mhz, half_power, fitted):
-    """Gaussian fit with free amplitude to M11 over 20 x 20 deg at culmination; 3.8 deg +- 5 % at 150 MHz in the paper."""
+    """Gaussian fit with free amplitude to M11, 20 x 20 deg, at culmination; 3.8 deg +- 5 % at 150 MHz in the paper."""
     lofar = instrument.load("telescopes", "lofar-hba", stations=PAIR)
     l, m, where = square(10, 81)
     m11 = lofar.mueller(where, transit(lofar.layout()), mhz * u.MHz, pointing=CENTRE, baseline=PAIR)[0, 0, :, 0, 0].real

@@ -37,7 +37,7 @@ def table(ran):
 
 
 def test_leakage_inside_4_deg_is_that_of_the_paper(table):
-    """I->P about 0.5 %, I->V below 0.003 % (Asad et al. 2015, section 4.2); an independent model has 0.67 % and 0.0021 %."""
+    """I->P about 0.5 %, I->V below 0.003 % (Asad et al. 2015); an independent model has 0.67 % and 0.0021 %."""
     use = (table["distance"].value <= 4) & ~table["near_null"]
     assert use.sum() > 100
     assert 0.5 < np.median(table["linear"][use].value) < 0.8

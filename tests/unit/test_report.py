@@ -15,7 +15,7 @@ from instrument.analyze.leakage import Leakage
 from instrument.errors import FileError, InputError
 from instrument.image.cube import Psf
 from instrument.observe.directions import offset
-from instrument.report import figures
+from instrument.report import figures, images, style
 from instrument.report.page import (
     Card,
     Cell,
@@ -28,9 +28,9 @@ from instrument.report.page import (
     Text,
     duration,
     number,
-    page_of_run,
     write_page,
 )
+from instrument.report.run_page import page_of_run
 from instrument.units import Direction
 
 CENTRE = Direction(2.15, 0.84)
@@ -78,11 +78,11 @@ def test_every_figure_is_written_and_not_blank(tmp_path):
         "linear": figures.bubbles(leakage_on_grid(), CENTRE),
         "circular": figures.bubbles(leakage_on_grid(), CENTRE, "circular"),
         "profile": figures.profile(leakage_on_grid()),
-        "images": figures.stokes_images(cube_of()),
-        "psf": figures.psf_image(cube_of()),
+        "images": images.stokes_images(cube_of()),
+        "psf": images.psf_image(cube_of()),
     }
     for name, drawing in drawings.items():
-        path = figures.save(drawing, tmp_path / f"{name}.png")
+        path = style.save(drawing, tmp_path / f"{name}.png")
         assert is_drawn(path), name
     assert not list(tmp_path.glob("*.part"))
 
@@ -134,8 +134,8 @@ def test_extreme_leakages_are_drawn_without_a_warning(tmp_path, scale, near_null
         warnings.simplefilter("error")
         warnings.simplefilter("ignore", DeprecationWarning)  # an older matplotlib with a newer pyparsing
         leakage = leakage_on_grid(near_null, expected=False, scale=scale)
-        figures.save(figures.bubbles(leakage, CENTRE), tmp_path / "a.png")
-        figures.save(figures.profile(leakage), tmp_path / "b.png")
+        style.save(figures.bubbles(leakage, CENTRE), tmp_path / "a.png")
+        style.save(figures.profile(leakage), tmp_path / "b.png")
 
 
 def test_one_source_at_the_centre_is_drawn():
@@ -155,14 +155,14 @@ def test_images_without_data_or_psf_are_drawn_and_a_psf_alone_is_asked_for(tmp_p
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.simplefilter("ignore", DeprecationWarning)  # an older matplotlib with a newer pyparsing
-        figures.save(figures.stokes_images(cube), tmp_path / "a.png")
+        style.save(images.stokes_images(cube), tmp_path / "a.png")
     with pytest.raises(InputError, match="no PSF"):
-        figures.psf_image(cube)
+        images.psf_image(cube)
 
 
 def test_a_large_image_is_shown_smaller_without_losing_a_source():
     cube = cube_of(pixels=1300, psf=False)
-    figure = figures.stokes_images(cube)
+    figure = images.stokes_images(cube)
     shown = figure.axes[0].images[0]
     assert shown.get_array().shape == (434, 434)  # 3 x 3 pixels in one, the last row and column padded
     assert np.nanmax(shown.get_array()) == 1 or np.isclose(np.nanmax(shown.get_array()), 1000)
@@ -175,7 +175,7 @@ def test_a_large_image_is_shown_smaller_without_losing_a_source():
 
 
 def test_the_psf_ellipse_lies_along_the_psf():
-    ax = figures.psf_image(cube_of())
+    ax = images.psf_image(cube_of())
     ellipse = ax.patches[0]
     ends = ellipse.get_patch_transform().transform([(0, 1), (0, -1)])
     east, north = (ends[0] - ends[1]) / 2
@@ -226,7 +226,7 @@ RECORD = {
 
 @pytest.fixture
 def page(tmp_path):
-    drawing = figures.save(figures.profile(leakage_on_grid()), tmp_path / "profile.png")
+    drawing = style.save(figures.profile(leakage_on_grid()), tmp_path / "profile.png")
     entry = FigureEntry(drawing, "Leakage <against> distance", wide=True)
     more = [Section("Spectra", [Text("a paragraph"), Table(["k"], [[1.5]])])]
     path = write_page(page_of_run(RECORD, [entry], leakage_on_grid().table(), more), tmp_path / "report.html")
