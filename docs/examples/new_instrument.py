@@ -4,12 +4,24 @@ from typing import Annotated
 
 import numpy as np
 from astropy import units as u
+from instrument_plugins.elements.dipole import CrossedDipole
 from pydantic import Field, SerializeAsAny
 
 import instrument
-from instrument import Chain, ElementBeam, Instrument, Layout, Level, Parallactic, StationBeam
+from instrument import (
+    Analyzer,
+    Chain,
+    ElementBeam,
+    GainTerm,
+    Instrument,
+    Layout,
+    Level,
+    Observation,
+    Parallactic,
+    Scene,
+    StationBeam,
+)
 from instrument.units import Metres
-from instrument_plugins.elements.dipole import CrossedDipole
 
 SITE = {"longitude_rad": np.deg2rad(116.67), "latitude_rad": np.deg2rad(-26.7), "height_m": 377.0}
 
@@ -38,5 +50,22 @@ class Ring(Instrument):
 
 
 if __name__ == "__main__":
-    ring = Ring(radius="150 m")
-    print(instrument.conformance.check(ring))
+    ring = Ring(radius="150 m", gain=GainTerm(rms=1e-3, seed=1))
+    print(str(instrument.conformance.check(ring)).splitlines()[0], "\n")
+    night = Observation(
+        phase_centre="12h00m00.0s -30d00m00s",
+        transit="2026-05-01",
+        duration=2 * u.hour,
+        interval=10 * u.min,
+        frequencies=[150] * u.MHz,
+    )
+    sky = instrument.load("skies", "grid", shape=(3, 3), spacing=4 * u.deg, flux=1 * u.Jy)
+    plan = Scene(name="ring", instrument=ring, sky=sky, observation=night).plan()
+    print(plan, "\n")
+    found = Analyzer(visibilities=plan.run(), sky=sky).leakage()
+    print("distance  I of 1 Jy seen  I to linear  I to circular")
+    for row in np.argsort(found.distance_rad, kind="stable"):
+        print(
+            f"{np.rad2deg(found.distance_rad[row]):.2f} deg  {found.stokes_jy[row, 0]:.4f} Jy"
+            f"       {found.linear_percent[row]:6.2f} %     {found.circular_percent[row]:.3f} %"
+        )

@@ -22,7 +22,8 @@ from instrument.sky.points import PointSky
 from instrument.units import Complex, Float, Int, unit_vectors
 from instrument.visibilities import Visibilities
 
-MOST_DIRECT = 1500  # groups of sources up to which the PSF matrix is formed; above, conjugate gradients
+MOST_DIRECT = 6000  # sources up to which the PSF matrix (300 MB) is formed; above, conjugate gradients
+ROWS = 512  # of that matrix at a time
 
 
 @dataclass(frozen=True)
@@ -142,45 +143,44 @@ class PhotometrySums:
         assert self.lmn is not None
         return station_phases(slot.uvw_lambda[None], self.lmn)[0]
 
-    def _envelopes(self, slot: _Slot) -> tuple[Int, Float]:
-        """Sources with shapes, and what their shapes take off each baseline (B, n)."""
+    def _adjoint(self, slot: _Slot, values: Complex) -> Float:
+        """Re A^H v of weighted values (B, 4): sums towards each group, (G, 4)."""
+        out = self._adjoint_sources(slot, self._fringes(slot), values)
+        return _gathered(out * self.mix[:, None], self.group, len(self.first))
+
+    def _adjoint_sources(self, slot: _Slot, z: Complex, values: Complex) -> Float:
+        """The same towards each source, (S, n) of values (B, n)."""
+        out = np.zeros((z.shape[1], values.shape[1]))
+        grid = np.zeros((len(z), len(z)), complex)
+        for k in range(values.shape[1]):
+            if values[:, k].any():
+                grid[slot.antenna1, slot.antenna2] = values[:, k]
+                out[:, k] = np.einsum("as,as->s", z.conj(), grid @ z).real
+        shaped = np.flatnonzero(self.sky.gaussian)
+        if len(shaped):
+            out[shaped] = (self._pattern(slot, z).conj().T @ values).real
+        return out
+
+    def _pattern(self, slot: _Slot, z: Complex) -> Complex:
+        """Visibilities of 1 Jy in each source with a shape, (B, n)."""
         shaped = np.flatnonzero(self.sky.gaussian)
         assert self.axes is not None
         uvw = slot.uvw_lambda[slot.antenna1] - slot.uvw_lambda[slot.antenna2]
         along = np.einsum("bc,skc->kbs", uvw, self.axes[shaped])
-        return shaped, np.exp(-2 * np.pi**2 * (along[0] ** 2 + along[1] ** 2))
-
-    def _adjoint(self, slot: _Slot, values: Complex) -> Float:
-        """Re A^H v of weighted values (B, 4): sums towards each group, (G, 4)."""
-        z = self._fringes(slot)
-        stations = len(z)
-        out = np.empty((z.shape[1], 4))
-        grid = np.zeros((stations, stations), complex)
-        for k in range(4):
-            if not values[:, k].any():
-                out[:, k] = 0.0
-                continue
-            grid[slot.antenna1, slot.antenna2] = values[:, k]
-            out[:, k] = np.einsum("as,as->s", z.conj(), grid @ z).real
-        shaped, envelope = self._envelopes(slot)
-        if len(shaped):
-            fringe = z[slot.antenna1][:, shaped] * z[slot.antenna2][:, shaped].conj() * envelope
-            out[shaped] = (fringe.conj().T @ values).real
-        return _gathered(out * self.mix[:, None], self.group, len(self.first))
+        envelope = np.exp(-2 * np.pi**2 * (along[0] ** 2 + along[1] ** 2))
+        return z[slot.antenna1][:, shaped] * z[slot.antenna2][:, shaped].conj() * envelope
 
     def _forward(self, slot: _Slot, flux: Float) -> Complex:
         """A f: visibilities (B, 4) of fluxes of groups (G, 4)."""
         z = self._fringes(slot)
         each = flux[self.group] * self.mix[:, None]
-        shaped, envelope = self._envelopes(slot)
         points = np.where(self.sky.gaussian[:, None], 0.0, each)
         out = np.zeros((len(slot.antenna1), 4), complex)
         for k in range(4):
             if points[:, k].any():
                 out[:, k] = ((z * points[:, k]) @ z.conj().T)[slot.antenna1, slot.antenna2]
-        if len(shaped):
-            fringe = z[slot.antenna1][:, shaped] * z[slot.antenna2][:, shaped].conj() * envelope
-            out += fringe @ each[shaped]
+        if self.sky.gaussian.any():
+            out += self._pattern(slot, z) @ each[self.sky.gaussian]
         return out
 
     def finish(self) -> SourceFluxes:
@@ -213,23 +213,31 @@ class PhotometrySums:
             return np.full((groups, 4), np.nan), Outcome.REFUSED, 0
         if not np.isfinite(channel.right).all():
             return np.full((groups, 4), np.nan), Outcome.NON_FINITE, 0
-        plain = all(slot.weight is None for slot in channel.slots) and not self.sky.gaussian.any()
-        if plain and groups <= MOST_DIRECT:
-            matrix = self._psf_matrix(channel)
-            values, vectors = np.linalg.eigh(matrix)
-            if values[0] < 1e-10 * values[-1]:
+        if all(slot.weight is None for slot in channel.slots) and len(self.group) <= MOST_DIRECT:
+            flux = _positive_solve(self._psf_matrix(channel), channel.right)
+            if flux is None:
                 return np.full((groups, 4), np.nan), Outcome.SINGULAR, 0
-            return vectors @ ((vectors.T @ channel.right) / values[:, None]), Outcome.CONVERGED, 0
+            return flux, Outcome.CONVERGED, 0
         return self._conjugate_gradients(channel)
 
     def _psf_matrix(self, channel: _Channel) -> Float:
         """PSF between all groups, (G, G), for equal weights: sum_{a<b} Re x_a x_b^* = (|sum_a x_a|^2 - A) / 2."""
-        groups = len(self.first)
-        out = np.zeros((len(self.group), len(self.group)))
+        sources, groups = len(self.group), len(self.first)
+        out = np.zeros((sources, sources))
+        shaped = np.flatnonzero(self.sky.gaussian)
+        columns = np.zeros((sources, len(shaped)))
         for slot in channel.slots:
             z = self._fringes(slot)
-            g = z.conj().T @ z
-            out += (g.real**2 + g.imag**2 - len(z)) / 2
+            for first in range(0, sources, ROWS):
+                # the upper triangle, in rows: its other half is its mirror
+                g = z[:, first : first + ROWS].conj().T @ z[:, first:]
+                out[first : first + ROWS, first:] += (g.real**2 + g.imag**2 - len(z)) / 2
+            if len(shaped):  # a source with a shape is not a product of stations: its own baselines, towards all others
+                towards = self._pattern(slot, z)
+                columns += self._adjoint_sources(slot, z, towards)
+        upper = np.triu(out)
+        out = upper + np.triu(upper, 1).T
+        out[:, shaped], out[shaped] = columns, columns.T
         mixed = _gathered(out * self.mix[:, None], self.group, groups)
         return _gathered((mixed * self.mix).T.copy(), self.group, groups)
 
@@ -258,6 +266,19 @@ class PhotometrySums:
             direction = residual + np.divide(new, power, out=np.zeros(4), where=power > 0) * direction
             power = new
         return flux, Outcome.ITERATION_LIMIT, self.settings.iterations
+
+
+def _positive_solve(matrix: Float, right: Float) -> Float | None:
+    """matrix^-1 right by Cholesky; `None` where the matrix is singular (condition above 1e10)."""
+    from scipy.linalg import LinAlgError, cho_factor, cho_solve, lapack
+
+    size = np.abs(matrix).sum(axis=0).max()
+    try:
+        factor = cho_factor(matrix, lower=True)
+    except LinAlgError:
+        return None
+    reciprocal, _ = lapack.dpocon(factor[0], size, uplo="L")
+    return np.asarray(cho_solve(factor, right)) if reciprocal > 1e-10 else None
 
 
 def _groups(sky: PointSky) -> tuple[Int, Int, tuple[str, ...]]:

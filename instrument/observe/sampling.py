@@ -124,6 +124,19 @@ class Sampling:
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(rho > 0, p / rho, 1.0), np.where(rho > 0, q / rho, 0.0)
 
+    @property
+    def azimuth(self) -> Float:
+        """Azimuth as astronomers count it, from q (north) through p (east), rad in 0 to 2 pi (T, A, S)."""
+        cos, sin = self.azimuth_cos_sin
+        return np.arctan2(cos, sin) % (2 * np.pi)
+
+    @property
+    def parallactic_angle(self) -> Float:
+        """Angle at each source from north through east to the zenith, rad (T, A, S)."""
+        zenith = self.layout.axes[:, 2]
+        north = np.cross(self.itrf, self.east_itrf)
+        return np.swapaxes(np.arctan2(self.east_itrf @ zenith.T, north @ zenith.T), 1, 2)
+
     @cached_property
     def lmn(self) -> Float:
         """Direction cosines l, m and n - 1 about the phase centre (S, 3)."""

@@ -38,6 +38,6 @@ def test_tiles_and_dipoles_equal_the_survey(survey):
 
 def test_antennas_of_the_low_band_equal_the_survey(survey):
     lofar = instrument.load("telescopes", "lofar-lba", antennas="all")
-    (level,) = lofar.chain().terms[0].levels
+    (level,) = lofar.chain().beams().terms[0].levels
     for station, antennas in zip(lofar.stations, level.offsets_m, strict=True):
         np.testing.assert_allclose(antennas, survey.antenna_etrs(station) - survey.phase_centres[station], atol=1e-3)
