@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import importlib
+import inspect
 import json
+import re
 from abc import ABC
 from collections.abc import Mapping
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, get_args
 
 import numpy as np
 from pydantic import (
     BaseModel,
     ConfigDict,
     ModelWrapValidatorHandler,
+    SerializationInfo,
     SerializerFunctionWrapHandler,
     ValidationError,
     model_serializer,
@@ -33,10 +36,15 @@ class Component(BaseModel, ABC):
     typed with an abstract component also takes the name of a plugin when the class names its `plugin_kind`.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True, populate_by_name=True)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", arbitrary_types_allowed=True, populate_by_name=True, ser_json_inf_nan="constants"
+    )
     plugin_kind: ClassVar[str | None] = None
 
-    def __init__(self, /, **fields: Any) -> None:
+    def __init__(self, *values: Any, **fields: Any) -> None:
+        if values:
+            known = ", ".join(f"{name}=..." for name in type(self).model_fields)
+            raise InputError(f"{type(self).__name__} takes its settings by keyword: {known}")
         try:
             super().__init__(**fields)
         except ValidationError as error:
@@ -53,11 +61,16 @@ class Component(BaseModel, ABC):
             found = _class_of(str(data[TAG]), cls)
             fields = {k: v for k, v in data.items() if k != TAG}
             return handler(fields) if found is cls else found(**fields)
+        if isinstance(data, Mapping) and inspect.isabstract(cls):
+            raise InputError(f"{cls.__name__} is abstract: the text must name a class under '{TAG}'")
         return handler(data)
 
     @model_serializer(mode="wrap")
-    def _with_tag(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {TAG: f"{type(self).__module__}:{type(self).__qualname__}", **handler(self)}
+    def _with_tag(self, handler: SerializerFunctionWrapHandler, info: SerializationInfo) -> Any:
+        fields = handler(self)
+        if not type(self).model_fields.keys() <= fields.keys():  # the field that holds it is typed with a base class
+            return type(self).__pydantic_serializer__.to_python(self, mode=info.mode)
+        return {TAG: f"{type(self).__module__}:{type(self).__qualname__}", **fields}
 
     def to_json(self, indent: int | None = None) -> str:
         """The component as JSON text; every value with a unit is a string with that unit."""
@@ -81,6 +94,8 @@ class Component(BaseModel, ABC):
 
     def with_fields(self, **fields: Any) -> Self:
         """A copy with some fields given anew, validated like the first time."""
+        names = {info.alias: k for k, info in type(self).model_fields.items() if info.alias}
+        fields = {names.get(k, k): v for k, v in fields.items()}
         kept = {k: getattr(self, k) for k in type(self).model_fields if k not in fields}
         for name, value in kept.items():
             kept[name] = _at_the_door(type(self), name, value)
@@ -88,7 +103,9 @@ class Component(BaseModel, ABC):
 
     def fingerprint(self) -> str:
         """Hex digest of the fields: equal components have equal fingerprints."""
-        return hashlib.sha256(self.to_json().encode()).hexdigest()[:16]
+        # -0.0 equals 0.0
+        text = re.sub(r"(?<!\w)-0\.0(?!\d)", "0.0", self.to_json())
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def __eq__(self, other: object) -> bool:
         if type(other) is not type(self):
@@ -98,12 +115,20 @@ class Component(BaseModel, ABC):
     def __hash__(self) -> int:
         return hash(self.fingerprint())
 
+    def __setstate__(self, state: dict[Any, Any]) -> None:
+        super().__setstate__(state)
+        for value in self.__dict__.values():  # pickling forgets that arrays are read-only
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+
 
 def _at_the_door(cls: type[Component], name: str, value: Any) -> Any:
     """A stored SI value as it would be given: with its unit."""
     from instrument.units import In
 
-    for mark in cls.model_fields[name].metadata:
+    info = cls.model_fields[name]
+    inner = [mark for option in get_args(info.annotation) for mark in getattr(option, "__metadata__", ())]  # X | None
+    for mark in (*info.metadata, *inner):
         if isinstance(mark, In) and value is not None:
             from astropy import units as u
 
@@ -167,4 +192,4 @@ def _fields_at(cls: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
         info = getattr(fields, "model_fields", {}).get(step)
         options = [info.annotation, *getattr(info.annotation, "__args__", ())] if info else []
         fields = next((o for o in options if hasattr(o, "model_fields")), None)
-    return list(getattr(fields, "model_fields", {}))
+    return [info.alias or name for name, info in getattr(fields, "model_fields", {}).items()]

@@ -60,14 +60,19 @@ def inverse(a: Complex) -> Complex:
 
 
 def singular_values(a: Complex) -> tuple[Float, Float]:
-    """Largest and smallest singular value, (...), in closed form."""
-    power = (np.abs(a) ** 2).sum(axis=(-2, -1))
-    d = np.abs(det(a))
-    high = np.sqrt(0.5 * (power + np.sqrt(np.maximum(power**2 - 4 * d**2, 0))))
-    # |det| / high, not the root of a difference: keeps every digit of a small value
-    with np.errstate(divide="ignore", invalid="ignore"):
-        low = np.where(high > 0, d / high, 0.0)
-    return high, low
+    """Largest and smallest singular value, (...), in closed form; NaN where the matrix is not finite."""
+    # scaled by its largest entry: the fourth powers below leave float64 at 1e-81 and 1e77
+    size = np.abs(a).max(axis=(-2, -1))
+    with np.errstate(all="ignore"):
+        scaled = a / np.where(size > 0, size, 1.0)[..., None, None]
+        rows = (np.abs(scaled) ** 2).sum(axis=-1)
+        across = scaled[..., 0, 0] * scaled[..., 1, 0].conj() + scaled[..., 0, 1] * scaled[..., 1, 1].conj()
+        # not the root of power^2 - 4 |det|^2: near a multiple of a unitary matrix that keeps half the digits
+        gap = np.hypot(rows[..., 0] - rows[..., 1], 2 * np.abs(across))
+        high = np.sqrt(0.5 * (rows.sum(axis=-1) + gap))
+        # |det| / high, not the root of a difference: keeps every digit of a small value
+        low = np.where(high > 0, np.abs(det(scaled)) / high, 0.0)
+        return high * size, low * size
 
 
 def condition(a: Complex) -> Float:

@@ -18,7 +18,7 @@ from instrument.jones.gain import GainTerm
 from instrument.jones.mueller import mueller
 from instrument.observe.layout import Layout
 from instrument.observe.sampling import Sampling
-from instrument.units import Complex, Direction, Float, to_si
+from instrument.units import Complex, Direction, Float, direction, instants, to_si
 
 State = Literal["absolute", "differential"]
 
@@ -82,6 +82,8 @@ class Instrument(Component):
     ) -> Complex:
         """Mueller matrices of one baseline (the first by default), complex (T, F, S, 4, 4)."""
         layout = self.layout()
+        if isinstance(baseline, str):
+            raise InputError(f"baseline = '{baseline}' is one station: give two, ('{baseline}', ...)")
         a, b = (layout.index(n) for n in baseline or layout.names[:2])
         pair = self.beam(directions, times, frequencies, pointing, state)[:, :, [a, b]]
         return mueller(pair[:, :, 0], pair[:, :, 1])
@@ -89,12 +91,12 @@ class Instrument(Component):
     def sampling(self, directions: Any, times: Any, frequencies: Any, pointing: Any = None) -> Sampling:
         """The `Sampling` of this array at directions (SkyCoord), times (Time) and frequencies (Quantity)."""
         from astropy.coordinates import SkyCoord
-        from astropy.time import Time
 
+        if isinstance(directions, str):
+            directions = direction(directions, "directions").skycoord
         if not isinstance(directions, SkyCoord):
             raise InputError(f"directions must be a SkyCoord, got {type(directions).__name__}")
-        when = times if isinstance(times, Time) else Time(times, scale="utc")
-        when = when.reshape(-1) if not when.isscalar else when.reshape((1,))
+        when = instants(times)
         icrs = directions.icrs
         ra, dec = np.atleast_1d(icrs.ra.rad).ravel(), np.atleast_1d(icrs.dec.rad).ravel()
         if not (np.all(np.isfinite(ra)) and np.all(np.isfinite(dec))):
@@ -102,10 +104,8 @@ class Instrument(Component):
         if pointing is None:
             if len(ra) > 1:
                 raise InputError(f"{len(ra)} directions need a pointing: give pointing=SkyCoord(...)")
-            centre = Direction(float(ra[0]), float(dec[0]))
-        else:
-            point = pointing.icrs
-            centre = Direction(float(np.squeeze(point.ra.rad)), float(np.squeeze(point.dec.rad)))
+            pointing = Direction(float(ra[0]), float(dec[0]))
+        centre = direction(pointing, "pointing")
         freq = np.atleast_1d(np.asarray(to_si(frequencies, "Hz", "frequencies"), float))
         return Sampling.build(self.layout(), when, freq, ra, dec, centre)
 
@@ -121,8 +121,8 @@ class Composed(Instrument):
         return self.stations
 
     def chain(self) -> Chain:
-        """Receivers, then the terms as given."""
-        return Chain(*self.receivers(), *self.terms.terms)
+        """Gains and feed errors if given, then the terms as given."""
+        return Chain(*(t for t in (self.gain, self.feed) if t is not None), *self.terms.terms)
 
 
 def warn_outside_band(chain: Chain, freq_hz: Float) -> None:

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 
 from instrument.analyze.analyzer import Analyzer
-from instrument.analyze.leakage import Leakage, expected_percent
+from instrument.analyze.leakage import CLEAR, Leakage, expected_percent
 from instrument.analyze.photometry import SourceFluxes
 from instrument.errors import InputError, Outcome
 from instrument.image.cube import StokesCube
-from instrument.jones.towards import Towards
+from instrument.model import Instrument
 from instrument.observe.sampling import Sampling
 from instrument.plan import Check, Plan
 from instrument.report.progress import progress_bar
@@ -38,6 +38,7 @@ class Result:
     """What a run made: its plan, cube, leakage, checks and timings, and the folder they are in."""
 
     scene: SceneFile
+    instrument: Instrument
     plan: Plan
     folder: Path
     cube: StokesCube | None = None
@@ -79,10 +80,9 @@ def run(
     """
     folder = _folder(scene_file.name, out)
     begin = time.perf_counter()
-    plan = scene_file.scene().plan(
-        tolerance=scene_file.tolerance, engine=scene_file.engine, memory=memory, workers=workers
-    )
-    result = Result(scene_file, plan, folder, seconds={"plan": time.perf_counter() - begin})
+    scene = scene_file.scene()
+    plan = scene.plan(tolerance=scene_file.tolerance, engine=scene_file.engine, memory=memory, workers=workers)
+    result = Result(scene_file, scene.instrument, plan, folder, seconds={"plan": time.perf_counter() - begin})
     show(str(plan))
     partial = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
@@ -131,7 +131,6 @@ def _compute(result: Result) -> None:
     """Stream the blocks through the stages that the scene has."""
     scene, plan = result.scene, result.plan
     centre = plan.problem.at.centre
-    beams = plan.problem.chain.beams()
     wants = scene.analyze.products if scene.analyze else ()
     images = photometry = density = None
     if scene.image is not None:
@@ -154,7 +153,7 @@ def _compute(result: Result) -> None:
                 block = block.with_noise(scene.noise.sefd * u.Jy, seed=SEED_STEP * scene.seed + NOISE_SEED)
             if scene.correct is not None:
                 with result.timed("correct"):
-                    block = block.corrected(Towards(chain=beams))
+                    block = block.without_beam(result.instrument)
             if images is not None:
                 with result.timed("image"):
                     images.add(block)
@@ -228,6 +227,7 @@ def record(result: Result, tables: dict[str, Any]) -> dict[str, Any]:
             "inside_4_deg": result.leakage.inside(4.0),
             "rings": result.leakage.rings(),
             "near_null": int(result.leakage.near_null.sum()),
+            "too_faint": int((~result.leakage.measured & ~result.leakage.near_null).sum()),
         }
     if result.cube is not None and result.cube.psf is not None:
         psf = result.cube.psf
@@ -245,7 +245,7 @@ def _stage_errors(result: Result) -> dict[str, str]:
     if result.scene.image is not None and result.cube is not None:
         out["image"] = f"gridding {result.scene.image.accuracy:.0e} of the image rms asked for"
     if result.leakage is not None and result.leakage.expected is not None:
-        use = ~result.leakage.near_null
+        use = result.leakage.measured
         use &= np.rad2deg(result.leakage.distance_rad) <= 4
         gap = np.abs(result.leakage.linear_percent - result.leakage.expected[:, 0])[use]
         if gap.size:
@@ -289,8 +289,11 @@ def summary(result: Result) -> str:
                 f" {row['linear_max']:8.5f}   {row['circular_median']:11.5f} {row['circular_max']:8.5f}"
             )
         near = int(result.leakage.near_null.sum())
+        faint = int((~result.leakage.measured).sum()) - near
         if near:
-            lines.append(f"{near} sources lie near a null of the beam (apparent flux below 1 %) and are left out above")
+            lines.append(f"left out: {near} sources near a null of the beam (apparent flux below 1 %)")
+        if faint:
+            lines.append(f"left out: {faint} sources too faint beside the others (error above {CLEAR:g} % of I)")
     if result.fluxes is not None:
         bad = [o.value for o in result.fluxes.outcome if o is not Outcome.CONVERGED]
         lines += [f"photometry fell short: {text}" for text in bad]

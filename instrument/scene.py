@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from pydantic import SerializeAsAny
-
 from instrument.component import Component
 from instrument.model import Instrument
 from instrument.observe.observation import Observation
@@ -18,8 +16,8 @@ class Scene(Component):
     """What is observed, with what, and when; `plan()` says what would be done, nothing is computed before `run`."""
 
     name: str = "scene"
-    instrument: SerializeAsAny[Instrument]
-    sky: SerializeAsAny[Sky]
+    instrument: Instrument
+    sky: Sky
     observation: Observation
 
     def plan(

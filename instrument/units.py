@@ -7,6 +7,7 @@ and go to JSON as a string with the unit.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple
 
@@ -83,6 +84,16 @@ Jansky = Annotated[float, In("Jy")]
 Bytes = Annotated[float, In("byte")]
 
 
+def plain(value: Any, dtype: type, name: str) -> Any:
+    """A copy of numbers as an array; raises `UnitError` for a `Quantity`, whose unit numpy would drop."""
+    if getattr(value, "unit", None) is not None:
+        raise UnitError(f"{name} takes plain numbers in SI units, got values in '{value.unit}': use .to_value(...)")
+    try:
+        return np.array(value, dtype=dtype)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} is not an array of numbers: {error}") from None
+
+
 @dataclass(frozen=True)
 class ArrayOf:
     """Marks a read-only array field: dtype and shape, `None` for a free axis."""
@@ -93,8 +104,10 @@ class ArrayOf:
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
         def check(value: object, info: core_schema.ValidationInfo) -> Any:
             if isinstance(value, dict) and {"real", "imag"} <= set(value):
-                value = np.array(value["real"], float) + 1j * np.array(value["imag"], float)
-            array: Any = np.array(value, dtype=self.dtype)
+                real = np.array(value["real"], float)
+                value, parts = np.empty(real.shape, complex), (real, value["imag"])
+                value.real, value.imag = parts  # real + 1j * imag would lose infinities
+            array: Any = plain(value, self.dtype, str(info.field_name))
             fits = array.ndim == len(self.shape) and all(
                 n in (None, m) for n, m in zip(self.shape, array.shape, strict=True)
             )
@@ -142,12 +155,24 @@ def unit_vectors(ra_rad: Float, dec_rad: Float) -> Float:
     return np.stack([np.cos(dec_rad) * np.cos(ra_rad), np.cos(dec_rad) * np.sin(ra_rad), np.sin(dec_rad)], axis=-1)
 
 
+WRITTEN = re.compile(r"(\S+)rad (\S+)rad")  # as `_write_direction` has it: read without any arithmetic
+
+
 def _direction(value: object, info: ValidationInfo) -> Direction:
+    return direction(value, info.field_name or "the direction")
+
+
+def direction(value: object, name: str = "the direction") -> Direction:
+    """One direction, of a SkyCoord or of text such as "08h13m36.0s +48d13m03s"."""
+    written = WRITTEN.fullmatch(value) if isinstance(value, str) else None
+    if written:
+        value = Direction(float(written[1]), float(written[2]))
     if isinstance(value, Direction):
+        if not np.all(np.isfinite(value)) or abs(value.dec_rad) > np.pi / 2:
+            raise InputError(f"{name} = {tuple(value)} rad is not a direction")
         return value
     from astropy.coordinates import SkyCoord
 
-    name = info.field_name
     try:
         coord = SkyCoord(value) if isinstance(value, str) else value
     except ValueError as error:
@@ -170,23 +195,29 @@ SkyDirection = Annotated[
 ]
 
 
-def _instant(value: object, info: ValidationInfo) -> Any:
+def instants(value: object, name: str = "times") -> Any:
+    """UTC `Time` (T,), of a Time or of text such as "2012-12-07T23:00:00", one or many."""
     from astropy.time import Time
 
     try:
-        time = Time(value, scale="utc") if isinstance(value, str) else value
-    except ValueError as error:
-        raise InputError(f"{info.field_name} = '{value}' is not a UTC time; write it like '2012-12-07T23:00:00'") from (
-            error
-        )
-    if not isinstance(time, Time) or not time.isscalar:
-        raise InputError(f"{info.field_name} = {value!r} is not one time; give a Time or '2012-12-07T23:00:00'")
-    return time.utc
+        time = value if isinstance(value, Time) else Time(value, scale="utc")
+    except ValueError:
+        raise InputError(f"{name} = {value!r} is not a UTC time; write it like '2012-12-07T23:00:00'") from None
+    return time.utc.reshape((-1,)) if not time.isscalar else time.utc.reshape((1,))
+
+
+def _instant(value: object, info: ValidationInfo) -> Any:
+    from astropy.time import Time
+
+    found = instants(value, info.field_name or "the time")
+    if len(found) != 1:
+        raise InputError(f"{info.field_name} takes one time, got {len(found)}")
+    return Time(_write_instant(found[0]), scale="utc")  # to 1 ns, so that it comes back from text as it was
 
 
 def _write_instant(value: Any) -> str:
     exact = value.utc.copy(format="isot")
-    exact.precision = 9
+    exact.precision, exact.out_subfmt = 9, "*"  # a Time made from a day would else write the day only
     return str(exact.value)
 
 

@@ -15,6 +15,7 @@ from instrument.jones.base import JonesTerm
 from instrument.jones.chain import Chain
 from instrument.jones.gain import slot_normals
 from instrument.jones.towards import Towards
+from instrument.model import Instrument
 from instrument.observe.layout import Layout
 from instrument.observe.sampling import Sampling
 from instrument.units import Bool, Complex, Direction, Float, Int, to_si
@@ -66,6 +67,13 @@ class Visibilities:
             shape = getattr(self, name).shape
             if len(shape) != 3 or any(n not in (1, m) for n, m in zip(shape, want, strict=False)):
                 raise InputError(f"{name} has shape {shape}, needed {want[:3]} with length 1 where constant")
+
+    def __repr__(self) -> str:
+        times, channels, baselines = self.data.shape[:3]
+        return (
+            f"Visibilities({times} times, {channels} channels, {baselines} baselines, {len(self.layout)} stations, "
+            f"{100 * float(np.mean(self.flag)):.3g} % flagged, {self.beam_state})"
+        )
 
     @property
     def layout(self) -> Layout:
@@ -160,6 +168,10 @@ class Visibilities:
                 )
             state = BeamState("centre", term.direction or self.phase_centre)
         return replace(self, data=data, flag=flag, beam_state=state)
+
+    def without_beam(self, instrument: Instrument) -> Visibilities:
+        """The same with the beam of an instrument towards the phase centre taken out, not its gains and feeds."""
+        return self.corrected(Towards(chain=instrument.chain().beams()))
 
     def corrupted(self, term: JonesTerm | Chain) -> Visibilities:
         """J_a V J_b^H for a direction-independent term; inverse of `corrected`."""

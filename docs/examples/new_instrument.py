@@ -5,7 +5,7 @@ from typing import Annotated
 import numpy as np
 from astropy import units as u
 from instrument_plugins.elements.dipole import CrossedDipole
-from pydantic import Field, SerializeAsAny
+from pydantic import Field
 
 import instrument
 from instrument import (
@@ -23,7 +23,7 @@ from instrument import (
 )
 from instrument.units import Metres
 
-SITE = {"longitude_rad": np.deg2rad(116.67), "latitude_rad": np.deg2rad(-26.7), "height_m": 377.0}
+SITE = {"longitude": 116.67 * u.deg, "latitude": -26.7 * u.deg, "height": 377 * u.m}
 
 
 class Ring(Instrument):
@@ -32,13 +32,13 @@ class Ring(Instrument):
     count: Annotated[int, Field(ge=2)] = 8
     radius: Metres = 200.0
     pitch: Metres = 1.1
-    element: SerializeAsAny[ElementBeam] = CrossedDipole(height=0.3 * u.m)
+    element: ElementBeam = CrossedDipole(height=0.3 * u.m)
 
     def layout(self):
         """Stations, from offsets east, north and up of the site."""
         angle = 2 * np.pi * np.arange(self.count) / self.count
         enu = self.radius * np.stack([np.sin(angle), np.cos(angle), 0 * angle], axis=-1)
-        return Layout.from_enu([f"tile{k}" for k in range(self.count)], enu, **SITE)
+        return Layout.from_enu([f"tile{k}" for k in range(self.count)], enu * u.m, **SITE)
 
     def chain(self):
         """Gains and feeds if given, the tile, the parallactic rotation."""

@@ -99,8 +99,8 @@ def main():
 
 {date.today()}, {os.cpu_count()} cores ({platform.machine()}), Python {platform.python_version()},
 {", ".join(f"{k} {version(v)}" for k, v in used.items())}.
-59 stations, {given.times} integrations, 225 sources, 150 MHz, absolute beams; whole processes in turn, {given.runs} times.
-Made by `python docs/reports/predict_speed.py --times {given.times} --runs {given.runs}`.
+59 stations, {given.times} integrations, 225 sources, 150 MHz, absolute beams; whole processes in turn,
+{given.runs} times. Made by `python docs/reports/predict_speed.py --times {given.times} --runs {given.runs}`.
 
 | | this package | DP3 predict |
 |---|---|---|
@@ -110,8 +110,8 @@ Made by `python docs/reports/predict_speed.py --times {given.times} --runs {give
 | precision of the result | float64 | complex64 |
 
 DP3 takes {np.median(ratios):.1f} times as long (median of the pairs; {min(ratios):.1f} to {max(ratios):.1f}).
-Difference of the visibilities: {np.sqrt(error / power):.1e} rms relative, which is that of the positions on Earth that DP3
-works with (see ../conventions.md).
+Difference of the visibilities: {np.sqrt(error / power):.1e} rms relative, which is that of the positions on
+Earth that DP3 works with (see ../conventions.md).
 """
     (HERE / "predict_speed.md").write_text(text)
     print(text)

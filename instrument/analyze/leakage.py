@@ -18,15 +18,19 @@ from instrument.observe.sampling import Sampling
 from instrument.units import Bool, Complex, Direction, Float, unit_vectors
 
 NULL = 0.01  # apparent over true flux below which a source lies near a null of the beam
+CLEAR, SURE = 0.1, 3.0  # a leakage counts as measured when its error is below 0.1 % of I, or a third of itself
 
 
 @dataclass(frozen=True)
 class Leakage:
     """Leakage of every source, one channel: fluxes (G, 4) in Jy, leakages in % of its apparent I (G,).
 
-    `near_null` marks sources whose apparent flux is below 1 % of the true one: their leakage is a ratio of two small
-    numbers and says little about the instrument. `expected` holds the same leakages (G, 2) from the beam model (the
-    mean Mueller matrix over baselines and times), where it was asked for.
+    The polarization that the sky has there, as a fraction of I, is taken out first. `error_jy` (4,) is what the rest of
+    the visibilities leaves on a flux (see `SourceFluxes`). `near_null` marks sources whose apparent flux is below 1 %
+    of the true one: their leakage is a ratio of two small numbers and says little about the instrument. `measured`
+    leaves those out, and those too faint beside their neighbours to be known to 0.1 % or a third of the leakage.
+    `expected` holds the same leakages (G, 2) from the beam model (the mean Mueller matrix over baselines and times),
+    where it was asked for.
     """
 
     names: tuple[str, ...]
@@ -35,21 +39,44 @@ class Leakage:
     distance_rad: Float
     model_jy: Float
     stokes_jy: Float
+    error_jy: Float
     freq_hz: float
     near_null: Bool
     expected: Float | None = None
 
+    def _share(self, values: Float) -> Float:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return 100 * values / np.abs(self.stokes_jy[:, 0])
+
+    @property
+    def leaked_jy(self) -> Float:
+        """Q, U, V in Jy beyond what the source has itself (G, 3)."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            own = np.where(self.model_jy[:, :1] != 0, self.model_jy[:, 1:] / self.model_jy[:, :1], 0.0)
+        return np.asarray(self.stokes_jy[:, 1:] - own * self.stokes_jy[:, :1])
+
     @property
     def linear_percent(self) -> Float:
         """sqrt(Q2 + U2) / |I|, % (G,)."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return 100 * np.hypot(self.stokes_jy[:, 1], self.stokes_jy[:, 2]) / np.abs(self.stokes_jy[:, 0])
+        return self._share(np.hypot(self.leaked_jy[:, 0], self.leaked_jy[:, 1]))
 
     @property
     def circular_percent(self) -> Float:
         """|V| / |I|, % (G,)."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return 100 * np.abs(self.stokes_jy[:, 3]) / np.abs(self.stokes_jy[:, 0])
+        return self._share(np.abs(self.leaked_jy[:, 2]))
+
+    @property
+    def error_percent(self) -> Float:
+        """Errors of the linear and the circular leakage, % of I (G, 2)."""
+        linear = np.hypot(self.error_jy[1], self.error_jy[2])
+        return np.stack([self._share(linear), self._share(self.error_jy[3])], axis=1)
+
+    @property
+    def measured(self) -> Bool:
+        """Which sources have a leakage that says something (G,)."""
+        with np.errstate(invalid="ignore"):
+            error = self.error_percent[:, 0]
+            return ~self.near_null & ((error <= CLEAR) | (SURE * error <= self.linear_percent))
 
     def table(self) -> Any:
         """Everything as an astropy table, one row a source, with units."""
@@ -66,10 +93,13 @@ class Leakage:
         out["I_model"] = self.model_jy[:, 0] * u.Jy
         out["linear"] = self.linear_percent * u.percent
         out["circular"] = self.circular_percent * u.percent
+        out["linear_error"] = self.error_percent[:, 0] * u.percent
+        out["circular_error"] = self.error_percent[:, 1] * u.percent
         if self.expected is not None:
             out["linear_expected"] = self.expected[:, 0] * u.percent
             out["circular_expected"] = self.expected[:, 1] * u.percent
         out["near_null"] = self.near_null
+        out["measured"] = self.measured
         out.meta["frequency_hz"] = self.freq_hz
         return out
 
@@ -81,12 +111,12 @@ class Leakage:
         partial.replace(target)
 
     def rings(self, edges_deg: tuple[float, ...] = (0.1, 1, 2, 3, 4, 5)) -> list[dict[str, float]]:
-        """Median and maximum leakage in rings about the centre; the first row is what lies inside the first edge."""
+        """Median and maximum leakage of measured sources in rings about the centre, the first within the first edge."""
         distance = np.rad2deg(self.distance_rad)
         rows = []
         for low, high in zip((0.0, *edges_deg[:-1]), edges_deg, strict=True):
             # a source at the very centre may be at 1e-15 deg
-            inside = (distance >= low) & (distance < high) & ~self.near_null
+            inside = (distance >= low) & (distance < high) & self.measured
             if not inside.any():
                 continue
             linear, circular = self.linear_percent[inside], self.circular_percent[inside]
@@ -104,8 +134,8 @@ class Leakage:
         return rows
 
     def inside(self, radius_deg: float) -> dict[str, float]:
-        """Median and maximum leakages of the sources within a radius, those near a null left out."""
-        use = (np.rad2deg(self.distance_rad) <= radius_deg) & ~self.near_null
+        """Median and maximum leakages of the measured sources within a radius."""
+        use = (np.rad2deg(self.distance_rad) <= radius_deg) & self.measured
         linear, circular = self.linear_percent[use], self.circular_percent[use]
         return {
             "sources": int(use.sum()),
@@ -128,6 +158,7 @@ def leakage_of(fluxes: SourceFluxes, centre: Direction, channel: int = 0, expect
         distance_rad=separation(unit_vectors(fluxes.ra_rad, fluxes.dec_rad), centre),
         model_jy=model,
         stokes_jy=measured,
+        error_jy=fluxes.error_jy[channel],
         freq_hz=float(fluxes.freq_hz[channel]),
         near_null=null | (model[:, 0] == 0),
         expected=expected,
@@ -159,7 +190,11 @@ def _kron(a: Complex, b: Complex) -> Complex:
 def expected_percent(
     chain: Chain, at: Sampling, stokes_jy: Float, channel: int = 0, differential: bool = True
 ) -> Float:
-    """Linear and circular polarization in % of I (S, 2) that sources of Stokes (S, 4) should show: the beam model's."""
+    """Linear and circular polarization in % of I (S, 2) that leaks into sources of Stokes (S, 4): the beam model's."""
     seen = np.einsum("sij,sj->si", mean_mueller(chain, at, differential)[channel], stokes_jy).real
     with np.errstate(divide="ignore", invalid="ignore"):
-        return 100 * np.stack([np.hypot(seen[:, 1], seen[:, 2]), np.abs(seen[:, 3])], axis=1) / np.abs(seen[:, :1])
+        own = np.where(stokes_jy[:, :1] != 0, stokes_jy[:, 1:] / stokes_jy[:, :1], 0.0)
+        leaked = seen[:, 1:] - own * seen[:, :1]
+        return (
+            100 * np.stack([np.hypot(leaked[:, 0], leaked[:, 1]), np.abs(leaked[:, 2])], axis=1) / np.abs(seen[:, :1])
+        )

@@ -28,13 +28,20 @@ ROWS = 512  # of that matrix at a time
 
 @dataclass(frozen=True)
 class SourceFluxes:
-    """Measured Stokes fluxes in Jy (F, G, 4) of G groups of sources (a patch, or a source by itself)."""
+    """Measured Stokes fluxes in Jy (F, G, 4) of G groups of sources (a patch, or a source by itself).
+
+    `error_jy` is the rms of what the solution leaves in the real or imaginary part of the visibilities over the root of
+    their number: right for noise. The change of apparent fluxes with time and baseline, which a constant flux cannot
+    follow, counts as noise here; it is not independent, and true errors of simulated fields are 0.7 to 2 times as
+    large in the median.
+    """
 
     names: tuple[str, ...]
     ra_rad: Float
     dec_rad: Float
     model_jy: Float  # (F, G, 4), what the sky has there
     stokes_jy: Float  # (F, G, 4)
+    error_jy: Float  # (F, 4), see below
     freq_hz: Float
     outcome: tuple[Outcome, ...]  # per channel
     iterations: int
@@ -79,6 +86,8 @@ class _Channel:
     right: Float
     slots: list[_Slot] = field(default_factory=list)
     total: float = 0.0
+    power: Float = field(default_factory=lambda: np.zeros(4))  # sum of w |V|^2
+    count: int = 0
 
 
 class PhotometrySums:
@@ -113,17 +122,16 @@ class PhotometrySums:
                 uvw = at.uvw_m[t] * (freq / LIGHT)
                 cut = self._inside(uvw, block)
                 plain = uniform and whole and cut is None and weight[0] > 0
-                slot = _Slot(
-                    uvw, None if plain else weight * (1.0 if cut is None else cut), block.antenna1, block.antenna2
-                )
-                channel.slots.append(slot)
+                shares = weight if cut is None else weight * cut
+                slot = _Slot(uvw, None if plain else shares, block.antenna1, block.antenna2)
+                used = np.ones(len(weight)) if plain else shares
                 # where a weight is zero the data may be NaN
-                values = stokes[k, f] * np.where(weight > 0, 1.0, 0.0)[:, None] if plain else None
-                if values is None:
-                    assert slot.weight is not None
-                    values = np.where(slot.weight[:, None] > 0, stokes[k, f], 0.0) * slot.weight[:, None]
-                channel.right += self._adjoint(slot, values)
-                channel.total += float(len(weight) if slot.weight is None else slot.weight.sum())
+                data: Complex = np.where(used[:, None] > 0, stokes[k, f], 0.0)
+                channel.slots.append(slot)
+                channel.right += self._adjoint(slot, data * used[:, None])
+                channel.power += (np.abs(data) ** 2 * used[:, None]).sum(axis=0)
+                channel.total += float(used.sum())
+                channel.count += int(np.count_nonzero(used))
 
     def _inside(self, uvw: Float, block: Visibilities) -> Float | None:
         if self.settings.uv_range is None:
@@ -188,11 +196,17 @@ class PhotometrySums:
         if not self.channels:
             raise InputError("no visibilities were given to measure fluxes in")
         freqs = np.array(sorted(self.channels))
-        found, outcomes, most = [], [], 0
+        found, outcomes, errors, most = [], [], [], 0
         for freq in freqs:
             flux, outcome, count = self._solve(self.channels[float(freq)])
             found.append(flux)
             outcomes.append(outcome)
+            channel = self.channels[float(freq)]
+            # |V - A f|^2 = |V|^2 - f . A^H V at the solution
+            left = np.maximum(channel.power - (flux * channel.right).sum(axis=0), 0.0)
+            errors.append(
+                np.sqrt(left / 2 / channel.total / max(channel.count, 1)) if channel.total else np.full(4, np.nan)
+            )
             most = max(most, count)
         stokes = self.sky.stokes(freqs)
         model = np.stack([_gathered(s, self.group, len(self.first)) for s in stokes])
@@ -202,6 +216,7 @@ class PhotometrySums:
             dec_rad=self.sky.dec_rad[self.first],
             model_jy=model,
             stokes_jy=np.stack(found),
+            error_jy=np.stack(errors),
             freq_hz=freqs,
             outcome=tuple(outcomes),
             iterations=most,

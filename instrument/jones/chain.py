@@ -7,7 +7,7 @@ from functools import cached_property, reduce
 from typing import Any, Self
 
 import numpy as np
-from pydantic import SerializeAsAny, model_validator
+from pydantic import model_validator
 
 from instrument import mat2
 from instrument.component import Component
@@ -36,7 +36,7 @@ class Factors:
 class Chain(Component):
     """Product of Jones terms, (T, F, A, S, 2, 2), written from receiver to sky: `Chain(GainTerm(), StationBeam())`."""
 
-    terms: tuple[SerializeAsAny[JonesTerm], ...] = ()
+    terms: tuple[JonesTerm, ...] = ()
 
     def __init__(self, *terms: JonesTerm, **fields: Any) -> None:
         super().__init__(**({"terms": terms} if terms else {}), **fields)

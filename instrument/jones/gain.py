@@ -41,6 +41,8 @@ class StationTable(JonesTerm):
     def _axes_fit(self) -> Self:
         if self.values is None:
             return self
+        if not np.all(np.isfinite(self.values)):
+            raise InputError("values must be finite: leave out a station rather than giving it NaN")
         for axis, name, coordinate in ((0, "slots_s", self.slots_s), (1, "freq_hz", self.freq_hz)):
             count = self.values.shape[axis]
             if count > 1 and (coordinate is None or len(coordinate) != count):

@@ -6,7 +6,7 @@ from functools import cached_property
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
-from pydantic import SerializeAsAny, model_validator
+from pydantic import model_validator
 
 from instrument.component import Component
 from instrument.errors import InputError
@@ -92,7 +92,7 @@ class StationBeam(JonesTerm):
     per_station: ClassVar[PerStation] = "own"
     blind_below_horizon: ClassVar[bool] = True
 
-    element: SerializeAsAny[ElementBeam]
+    element: ElementBeam
     levels: tuple[Level, ...]
     reference_frequency: Hertz | None = None
 

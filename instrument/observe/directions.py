@@ -1,8 +1,8 @@
 """Directions: ICRS vectors seen from the rotating Earth, with aberration, without any download.
 
 `d_itrf = M (s + v) / |s + v|` with M the GCRS-to-ITRS matrix (IAU 2000A/2006, UT1 and polar motion from the bundled
-IERS table) and v the velocity of the site over c. Against the full astropy chain this is good to 0.002 arcsec in the
-field of 3C196 and 0.022 arcsec anywhere (what is left is the light deflection of the Sun); see docs/conventions.md.
+IERS table) and v the velocity of the site over c. Against the full astropy chain what is left is the
+bending of light by the Sun, 0.0041 arcsec cot(elongation/2), and (v/c)^2, 0.002 arcsec; see docs/conventions.md.
 One direction serves all stations of an array.
 """
 

@@ -11,7 +11,7 @@ from pydantic import model_validator
 
 from instrument.component import Component
 from instrument.errors import InputError, did_you_mean
-from instrument.units import ArrayOf, Float, Int
+from instrument.units import ArrayOf, Float, Int, plain, to_si
 
 Positions = Annotated[Any, ArrayOf(float, (None, 3))]
 Axes = Annotated[Any, ArrayOf(float, (None, 3, 3))]
@@ -52,19 +52,18 @@ class Layout(Component):
     @classmethod
     def geodetic(cls, names: Sequence[str], positions_m: Float) -> Layout:
         """Layout whose axes are local east, north and up of the WGS84 ellipsoid."""
-        positions_m = np.asarray(positions_m, float)
+        positions_m = plain(positions_m, float, "positions_m")
         return cls(names=tuple(names), positions_m=positions_m, axes=geodetic_axes(positions_m))
 
     @classmethod
-    def from_enu(
-        cls, names: Sequence[str], enu_m: Float, longitude_rad: float, latitude_rad: float, height_m: float
-    ) -> Layout:
-        """Layout of stations given in m east, north and up (A, 3) of a WGS84 reference point, all with its axes."""
+    def from_enu(cls, names: Sequence[str], enu: Any, longitude: Any, latitude: Any, height: Any) -> Layout:
+        """Layout of stations east, north and up (A, 3) of a WGS84 reference point, all with its axes; with units."""
         import erfa
 
-        reference = np.asarray(erfa.gd2gc(1, longitude_rad, latitude_rad, height_m))
+        place = (to_si(longitude, "rad", "longitude"), to_si(latitude, "rad", "latitude"), to_si(height, "m", "height"))
+        reference = np.asarray(erfa.gd2gc(1, *place))
         axes = geodetic_axes(reference[None])
-        enu_m = np.asarray(enu_m, float)
+        enu_m = np.asarray(to_si(enu, "m", "enu"), float)
         return cls(
             names=tuple(names), positions_m=reference + enu_m @ axes[0], axes=np.repeat(axes, len(enu_m), axis=0)
         )
@@ -86,12 +85,17 @@ class Layout(Component):
     @cached_property
     def baselines(self) -> tuple[Int, Int]:
         """First and second station of every baseline, (B,) each; a < b, no autocorrelations."""
-        return np.triu_indices(len(self.names), 1)
+        a, b = np.triu_indices(len(self.names), 1)
+        a.setflags(write=False)
+        b.setflags(write=False)
+        return a, b
 
     @cached_property
     def centre_m(self) -> Float:
         """Mean position, ITRF m (3,); the site for which aberration is computed."""
-        return np.asarray(self.positions_m.mean(axis=0))
+        mean: Float = self.positions_m.mean(axis=0)
+        mean.setflags(write=False)
+        return mean
 
     @cached_property
     def frames(self) -> tuple[Int, Int]:

@@ -38,7 +38,7 @@ def bubbles(leakage: Leakage, centre: Direction | None = None, kind: Kind = "lin
     ax = axes_of(ax, (6.4, 6.4))
     percent = leakage.linear_percent if kind == "linear" else leakage.circular_percent
     east, north = offsets_deg(leakage.ra_rad, leakage.dec_rad, _centre(leakage) if centre is None else centre)
-    shown = ~leakage.near_null & np.isfinite(percent)
+    shown = leakage.measured & np.isfinite(percent)
     top = float(np.percentile(percent[shown], 98)) if shown.any() else 0.0
     top = top if top > 0 else 1.0
     power = int(np.floor(np.log10(top))) if top < 0.1 else 0
@@ -113,7 +113,7 @@ def profile(leakage: Leakage, ax: Axes | None = None) -> Axes:
     null are left out. Values far below the rest (a centre corrected to nothing) are triangles on the lower edge.
     """
     ax = axes_of(ax, (6.4, 5.2))
-    use = ~leakage.near_null
+    use = leakage.measured
     distance = np.rad2deg(leakage.distance_rad[use])
     measured = {"linear": leakage.linear_percent[use], "circular": leakage.circular_percent[use]}
     positive = np.concatenate([v[np.isfinite(v) & (v > 0)] for v in measured.values()])

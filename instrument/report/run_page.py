@@ -108,8 +108,8 @@ def _cards(record: Mapping[str, Any]) -> list[Card]:
     cards = []
     leakage, checks = record.get("leakage", {}), record.get("checks", {})
     if inside := leakage.get("inside_4_deg"):
-        null = leakage.get("near_null", 0)
-        note = f"{null} of the whole field near a null, left out" if null else "none near a null of the beam"
+        null, faint = leakage.get("near_null", 0), leakage.get("too_faint", 0)
+        note = f"left out in the whole field: {null} near a null, {faint} too faint"
         cards.append(Card("Sources in 4°", str(inside["sources"]), note))
         for kind in ("linear", "circular"):
             median, most = (number(inside[f"{kind}_{what}"]) for what in ("median", "max"))

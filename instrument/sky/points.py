@@ -128,15 +128,21 @@ class PointSky(Sky):
     def at(
         cls, directions: Any, stokes_jy: Any, frequency: Any = None, names: Sequence[str] | None = None, **fields: Any
     ) -> PointSky:
-        """Sources at a SkyCoord (S,) with Stokes parameters (S, 4), or Stokes I alone (S,), in Jy."""
+        """Sources at a SkyCoord (S,) with Stokes parameters (S, 4), or Stokes I alone (S,); plain numbers are Jy."""
         from instrument.units import to_si
 
         icrs = directions.icrs
         ra, dec = np.atleast_1d(icrs.ra.rad).ravel(), np.atleast_1d(icrs.dec.rad).ravel()
-        flux = np.asarray(stokes_jy, float)
+        given_unit = hasattr(stokes_jy, "unit")
+        flux = np.asarray(to_si(stokes_jy, "Jy", "stokes_jy") if given_unit else stokes_jy, float)
         if flux.ndim < 2 and not (flux.ndim == 1 and len(ra) == 1 and flux.size == 4):
             flux = np.atleast_1d(flux)[:, None] * np.array([1.0, 0.0, 0.0, 0.0])
-        flux = np.broadcast_to(np.atleast_2d(flux), (len(ra), 4))
+        flux = np.atleast_2d(flux)
+        if flux.shape not in ((len(ra), 4), (1, 4)):
+            raise InputError(
+                f"{len(ra)} directions need Stokes I ({len(ra)},) or I, Q, U, V ({len(ra)}, 4), not {flux.shape}"
+            )
+        flux = np.broadcast_to(flux, (len(ra), 4))
         reference = None if frequency is None else np.full(len(ra), to_si(frequency, "Hz", "frequency"))
         given = tuple(names) if names is not None else tuple(f"s{i}" for i in range(len(ra)))
         return cls(names=given, ra_rad=ra, dec_rad=dec, stokes_jy=flux, reference_hz=reference, **fields)

@@ -108,7 +108,7 @@ def _read_text_table(file: Path, lines: Sequence[str]) -> PointSky:
 
         try:
             header = get_header_from_yaml([t[2:] for t in lines if t.startswith("# ")][1:])
-        except Exception as error:
+        except Exception as error:  # readers of other people's files fail in many ways
             raise broken(file, None, f"the ECSV header does not parse: {_first_line(error)}") from None
         units = {c["name"]: str(c["unit"]) for c in header["datatype"] if c.get("unit")}
         delimiter = header.get("delimiter", " ")

@@ -8,7 +8,7 @@ import numpy as np
 from astropy import units as u
 from instrument_plugins.data import table
 from instrument_plugins.elements.hamaker import Hamaker
-from pydantic import Field, SerializeAsAny, field_validator
+from pydantic import Field, field_validator
 
 from instrument.errors import InputError, did_you_mean
 from instrument.jones.base import ElementBeam
@@ -90,12 +90,13 @@ class LofarHBA(_Lofar):
     `stations` (the 59 of Asad et al. 2015 by default; the paper does not name its 11 remote ones), `element`, `beam`
     "full" (element, tiles and station), "element", "array-factor" or `None` (feeds along north and east), `tiles`
     "surveyed" or "ideal" (the 5.15 m lattice: stations with one tile rotation then share their array factor, at an
-    error of 1.2e-4 of the peak within 10 deg), `tile_pointing` and `beam_pointing` (the phase centre by default).
+    error of 1.5e-4 of the peak within 10 deg, 4.5e-4 for CS401HBA1), `tile_pointing` and `beam_pointing` (the phase
+    centre by default).
     """
 
     station_file: ClassVar[str] = "lofar_hba_stations.ecsv"
     parts_file: ClassVar[str] = "lofar_hba_tiles.csv"
-    element: SerializeAsAny[ElementBeam] = Hamaker(band="hba")
+    element: ElementBeam = Hamaker(band="hba")
     tiles: Literal["surveyed", "ideal"] = "surveyed"
     tile_pointing: SkyDirection | None = None
 
@@ -146,7 +147,7 @@ class LofarLBA(_Lofar):
 
     station_file: ClassVar[str] = "lofar_lba_stations.csv"
     parts_file: ClassVar[str] = "lofar_lba_antennas.csv"
-    element: SerializeAsAny[ElementBeam] = Hamaker(band="lba")
+    element: ElementBeam = Hamaker(band="lba")
     antennas: Literal["outer", "inner", "all"] = "outer"
 
     def chain(self) -> Chain:

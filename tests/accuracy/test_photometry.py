@@ -130,3 +130,31 @@ def test_a_source_in_a_null_of_the_beam_is_said_to_be_there():
     lofar = instrument.load("telescopes", "lofar-hba", stations=STATIONS)
     vis = Scene(instrument=lofar, sky=sky, observation=night()).plan().run().corrected(Towards(chain=lofar.chain()))
     assert Analyzer(visibilities=vis, sky=sky).leakage().near_null.tolist() == [False, True]
+
+
+def test_polarization_of_the_sky_is_not_counted_as_leakage():
+    where = CENTRE.spherical_offsets_by([0, 2] * u.deg, [0, 1.5] * u.deg)
+    plain, own = (PointSky.at(where, np.array([[1, q, -q, v]] * 2)) for q, v in ((0.0, 0.0), (0.1, 0.05)))
+    lofar = instrument.load("telescopes", "lofar-hba", stations=STATIONS)
+    found = []
+    for sky in (plain, own):
+        vis = Scene(instrument=lofar, sky=sky, observation=night()).plan().run().without_beam(lofar)
+        found.append(Analyzer(visibilities=vis, sky=sky).leakage())
+    assert found[1].linear_percent[0] < 0.01  # at the centre; 14 % is the source's own
+    # away from it the beam turns and mixes what the source has, to first order in the leakage
+    assert found[1].linear_percent[1] == pytest.approx(found[0].linear_percent[1], abs=1.5)
+
+
+def test_error_of_fluxes_is_the_noise_when_there_is_noise():
+    sky = polarized(count=10)
+    vis = bare(sky, interval=2 * u.min)
+    sigma = vis.noise_jy(2820 * u.Jy)
+    errors, gaps = [], []
+    for seed in range(12):
+        found = ForcedPhotometry().measure(vis.with_noise(2820 * u.Jy, seed), sky)
+        errors.append(found.error_jy[0])
+        gaps.append(found.stokes_jy[0] - sky.stokes_jy)
+    # Stokes parameters are means of two correlations, so each part has sigma / sqrt 2; a flux uses the real part only
+    count = vis.data.shape[0] * vis.data.shape[2]
+    assert np.mean(errors, axis=0) == pytest.approx([sigma / np.sqrt(2 * count)] * 4, rel=0.02)
+    assert np.std(gaps) == pytest.approx(sigma / np.sqrt(2 * count), rel=0.15)

@@ -312,7 +312,7 @@ class Telescope(Instrument):
             "random": lambda: Chain(GainTerm(values=rng.random((1, 1, 1, 2)))),
             "no parallactic": lambda: Chain(Fine()),
             "starts at the horizon": lambda: Chain(Parallactic()),
-            "nan": lambda: Chain(GainTerm(values=np.full((1, 1, 1, 2), np.nan))),
+            "nan": lambda: Chain(GainTerm(values=np.full((1, 1, 1, 2), 0.0))),
             "zero": lambda: Chain(GainTerm(values=np.zeros((1, 1, 1, 2)))),
             "other stations": lambda: Chain(GainTerm(values=np.ones((1, 1, 3, 2)))),
             "other factors": lambda: Chain(OtherScalar()),

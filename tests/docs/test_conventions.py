@@ -29,6 +29,7 @@ from instrument.jones.station import ArrayFactor
 from instrument.observe.directions import LIGHT
 
 LONGITUDE, LATITUDE = np.deg2rad(6.87), np.deg2rad(52.9)
+SITE = (LONGITUDE * u.rad, LATITUDE * u.rad, 0 * u.m)
 CENTRE = SkyCoord("08h13m36.0s +52d54m00s")  # culminates at the zenith, to 0.1 deg
 FIELD = SkyCoord("08h13m36.0s +48d13m03s")  # 3C196
 NIGHT = Observation(
@@ -39,7 +40,7 @@ LAMBDA = LIGHT / 150e6
 
 def pair(east=0.0, north=0.0, up=0.0):
     """Two stations, the first of them displaced from the second, m."""
-    return Layout.from_enu(["first", "second"], [[east, north, up], [0, 0, 0]], LONGITUDE, LATITUDE, 0.0)
+    return Layout.from_enu(["first", "second"], [[east, north, up], [0, 0, 0]] * u.m, *SITE)
 
 
 def at(sky_offset, stokes=(1.0, 0.0, 0.0, 0.0), **fields):
@@ -250,7 +251,7 @@ def test_array_factors_are_1_at_the_pointing_and_have_positive_phase_towards_the
 
 def test_in_images_east_is_left_and_north_is_up():
     night = NIGHT.with_fields(duration=6 * u.hour, interval=20 * u.min)
-    layout = Layout.from_enu("abcd", [[0, 0, 0], [400, 90, 0], [-150, 310, 0], [80, -260, 0]], LONGITUDE, LATITUDE, 0.0)
+    layout = Layout.from_enu("abcd", [[0, 0, 0], [400, 90, 0], [-150, 310, 0], [80, -260, 0]] * u.m, *SITE)
     vis = observe(at((2, 1), (1.0, 0.5, -0.25, 0.125)), layout, night=night)
     cube = Imager(pixels=64, pixel=6 * u.arcmin).image(vis)
     y, x = np.unravel_index(cube.data[0, 0].argmax(), (64, 64))

@@ -126,7 +126,7 @@ wide, GAUSSIAN, 08:16:00, +47.30.00, 5, 0.5, 0, 0, 150e6, [], true, 10, 25, 120,
 
 
 def test_a_sky_file_means_the_same_to_dp3(dp3, night, tmp_path):
-    """Spectra of both kinds, rotation measures of both kinds, shapes with either axis first: the same text, read by both."""
+    """Spectra and rotation measures of both kinds, shapes with either axis first: one text, read by both."""
     path = tmp_path / "kinds.skymodel"
     path.write_text(FILE)
     bare = instrument.load("telescopes", "lofar-hba", beam=None)

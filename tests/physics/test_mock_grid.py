@@ -65,15 +65,18 @@ def test_centre_has_no_leakage(table):
 
 
 def test_measured_leakage_is_that_of_the_beam_model(table):
-    """Forced photometry against the mean Mueller matrix: two ways to the same figure.
+    """Forced photometry against the mean Mueller matrix: two ways to the same figure, within the error stated.
 
-    Fluxes are taken as constant; the leakage of 224 neighbours, which varies over the night by as much as it is, leaves
-    1e-2 of itself through their sidelobes. A source alone agrees to 1e-6 (tests/accuracy/test_photometry.py).
+    Fluxes are taken as constant; the leakage of 224 neighbours, which varies over the night by as much as it is, stays
+    in the visibilities. A source alone agrees to 1e-9 (tests/accuracy/test_photometry.py).
     """
-    use = (table["distance"].value <= 4) & ~table["near_null"]
+    use = table["measured"]
     gap = np.abs(table["linear"] - table["linear_expected"])[use].value
-    assert np.median(gap) < 0.015 * np.median(table["linear"][use].value)
-    assert gap.max() < 0.08 * table["linear"][use].value.max()
+    error = table["linear_error"][use].value
+    assert np.median(gap / error) < 2.5  # 1.9: neighbouring baselines and times are not independent
+    assert (gap / error).max() < 11
+    inside = table["distance"][use].value <= 4
+    assert np.median(gap[inside]) < 0.015 * np.median(table["linear"][use].value[inside])
 
 
 def test_peak_memory_is_below_2_gb(ran):

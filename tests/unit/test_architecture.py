@@ -208,7 +208,7 @@ from astropy.coordinates import SkyCoord
 import instrument as ins
 
 enu = np.array([[0, 0, 0], [100, 0, 0], [0, 200, 1.0]])
-layout = ins.Layout.from_enu(["a", "b", "c"], enu, 0.12, 0.92, 50.0)
+layout = ins.Layout.from_enu(["a", "b", "c"], enu * u.m, 0.12 * u.rad, 0.92 * u.rad, 50 * u.m)
 centre = SkyCoord("08h13m36.0s +48d13m03s")
 scene = ins.Scene(
     instrument=ins.Composed(stations=layout, terms=ins.Chain(ins.GainTerm(values=[[[[2, 2], [1, 1], [1, 1]]]]))),
