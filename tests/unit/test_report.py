@@ -144,7 +144,7 @@ def test_one_source_at_the_centre_is_drawn():
     leakage = leakage_on_grid()
     keep = leakage.distance_rad < 1e-6
     one = Leakage(
-        **{k: v[keep] if np.shape(v)[:1] == (25,) else v for k, v in vars(leakage).items()}
+        **{k: v[keep] if isinstance(v, np.ndarray) and len(v) == 25 else v for k, v in vars(leakage).items()}
         | {"names": ("s12",), "error_jy": leakage.error_jy}
     )
     assert len(figures.bubbles(one, CENTRE).collections[0].get_offsets()) == 1
