@@ -119,9 +119,7 @@ def _run(given: argparse.Namespace) -> int:
 
 def _plan(given: argparse.Namespace) -> int:
     _, scene_file = _scene_file(given)
-    plan = scene_file.scene().plan(
-        tolerance=scene_file.tolerance, engine=scene_file.engine, memory=given.memory, workers=given.workers
-    )
+    plan = scene_file.plan(scene_file.scene(), given.memory, given.workers)
     print(plan)
     return DONE
 

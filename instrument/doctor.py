@@ -35,9 +35,9 @@ def doctor(show: Callable[[str], None]) -> bool:
     """Print what works; true when the self-test passes and no plugin is broken."""
     show(f"python        {platform.python_version()} on {platform.platform()}")
     for name in NEEDED:
-        show(f"{name:<20} {_version(name)}")
+        show(f"{name:<20} {package_version(name)}")
     for name, use in OPTIONAL.items():
-        show(f"{name:<20} {_version(name)} (optional: {use})")
+        show(f"{name:<20} {package_version(name)} (optional: {use})")
     show(f"cores         {os.cpu_count()}")
     show(f"memory        {_memory_gb():.1f} GB")
     show(f"Earth table   measured and predicted to {_table_end()}")
@@ -70,7 +70,8 @@ def self_test() -> float:
     return worst
 
 
-def _version(name: str) -> str:
+def package_version(name: str) -> str:
+    """Version of an installed package, or "not installed"."""
     try:
         return version(name)
     except PackageNotFoundError:

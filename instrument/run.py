@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ import numpy as np
 from instrument.analyze.analyzer import Analyzer
 from instrument.analyze.leakage import CLEAR, Leakage, expected_percent
 from instrument.analyze.photometry import SourceFluxes
+from instrument.doctor import package_version
 from instrument.errors import InputError, Outcome
 from instrument.image.cube import StokesCube
 from instrument.model import Instrument
@@ -81,7 +81,7 @@ def run(
     folder = _folder(scene_file.name, out)
     begin = time.perf_counter()
     scene = scene_file.scene()
-    plan = scene.plan(tolerance=scene_file.tolerance, engine=scene_file.engine, memory=memory, workers=workers)
+    plan = scene_file.plan(scene, memory, workers)
     result = Result(scene_file, scene.instrument, plan, folder, seconds={"plan": time.perf_counter() - begin})
     show(str(plan))
     partial = folder.with_name(f".{folder.name}.partial")
@@ -191,7 +191,7 @@ def record(result: Result, tables: dict[str, Any]) -> dict[str, Any]:
         "title": result.scene.title,
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "seed": result.scene.seed,
-        "versions": {"python": platform.python_version(), **{p: _version(p) for p in PACKAGES}},
+        "versions": {"python": platform.python_version(), **{p: package_version(p) for p in PACKAGES}},
         "machine": {"system": platform.platform(), "workers": plan.workers},
         "scene": tables,
         "plan": {
@@ -254,13 +254,6 @@ def _stage_errors(result: Result) -> dict[str, str]:
                 f"{gap.max():.1e} at most (linear)"
             )
     return out
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "unknown"
 
 
 def _write(result: Result, tables: dict[str, Any], folder: Path) -> None:

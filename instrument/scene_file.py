@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import tomllib
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -20,11 +21,13 @@ from instrument.jones.feed import FeedTerm
 from instrument.jones.gain import GainTerm
 from instrument.model import Instrument
 from instrument.observe.observation import Observation
+from instrument.plan import Item, Plan
 from instrument.registry import available, load
 from instrument.scene import Scene
 from instrument.sky.base import Sky
 from instrument.units import Float, Hertz, HertzArray, Instant, Jansky, Seconds, SkyDirection
 
+STAGES = ("noise", "correct", "image", "analyze")
 SEED_STEP = 1000  # seeds of the stages of a scene are derived from its one seed
 
 
@@ -148,6 +151,28 @@ class SceneFile(Component):
         with _in_table("observation"):
             observation = self.observation.observation()
         return Scene(name=self.name, instrument=self.telescope(), sky=self.sky_model(), observation=observation)
+
+    def products_uv_range(self) -> tuple[float, float] | None:
+        """The uv range, in wavelengths, that holds all the products asked for; `None` when one needs all baselines."""
+        ranges = [self.image.uv_range] if self.image else []
+        ranges += [self.analyze.uv_range] if self.analyze and self.analyze.products else []
+        given = [r for r in ranges if r is not None]
+        if not given or len(given) < len(ranges):
+            return None
+        return min(r[0] for r in given), max(r[1] for r in given)
+
+    def plan(self, scene: Scene, memory: Any = None, workers: int | None = None) -> Plan:
+        """The plan of its scene: baselines that no product needs and stages that are absent are left out."""
+        found = scene.plan(
+            tolerance=self.tolerance,
+            engine=self.engine,
+            memory=memory,
+            workers=workers,
+            uv_range=self.products_uv_range(),
+        )
+        absent = [stage for stage in STAGES if getattr(self, stage) is None]
+        items = (Item(", ".join(absent), "absent from the scene"),) if absent else ()
+        return replace(found, left_out=found.left_out + items)
 
 
 class _in_table:

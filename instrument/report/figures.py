@@ -30,8 +30,8 @@ Kind = Literal["linear", "circular"]
 def bubbles(leakage: Leakage, centre: Direction | None = None, kind: Kind = "linear", ax: Axes | None = None) -> Axes:
     """Leakage of every source over the field: area and colour of a bubble are its % (G,), east is left.
 
-    Sources near a null of the beam are grey crosses. The range of colours ends at the 98th percentile. `centre` is the
-    phase centre; without it the source nearest to it must be within 0.01 deg of it.
+    Sources that are not measured (near a null, or too faint) are grey crosses. The range of colours ends at the 98th
+    percentile. `centre` is the phase centre; without it the source nearest to it must be within 0.01 deg of it.
     """
     if kind not in ("linear", "circular"):
         raise InputError(f"kind = '{kind}' is not one of 'linear', 'circular'")
@@ -82,7 +82,14 @@ def bubbles(leakage: Leakage, centre: Direction | None = None, kind: Kind = "lin
     drawn.set_label("measured")
     lost = ~shown
     ax.scatter(
-        east[lost], north[lost], s=min(16, widest**2 / 4), marker="x", color=GREY, lw=0.9, zorder=2, label="near a null"
+        east[lost],
+        north[lost],
+        s=min(16, widest**2 / 4),
+        marker="x",
+        color=GREY,
+        lw=0.9,
+        zorder=2,
+        label="not measured",
     )
     bar = ax.figure.colorbar(
         drawn, ax=ax, fraction=0.045, pad=0.02, extend="max" if (values[shown] > top).any() else "neither"
@@ -99,7 +106,7 @@ def bubbles(leakage: Leakage, centre: Direction | None = None, kind: Kind = "lin
     below: Any = {"loc": "upper center", "frameon": False, "borderpad": 0}
     ax.add_artist(ax.legend(handles=keys, bbox_to_anchor=(0.5, -0.15), ncols=3, **below))
     if lost.any():
-        text = f"near a null: not measured ({lost.sum()})"
+        text = f"not measured: near a null, or too faint ({lost.sum()})"
         cross = Line2D([], [], ls="", marker="x", ms=4, color=GREY, label=text)
         ax.legend(handles=[cross], bbox_to_anchor=(0.5, -0.23), **below)
     return ax
@@ -149,7 +156,7 @@ def profile(leakage: Leakage, ax: Axes | None = None) -> Axes:
     if below:
         keys.append(Line2D([], [], ls="", marker="v", ms=6, color=INK, label=f"below the axis ({below})"))
     if not use.all():
-        text = f"near a null: left out ({np.count_nonzero(~use)})"
+        text = f"not measured: left out ({np.count_nonzero(~use)})"
         keys.append(Line2D([], [], ls="", marker="x", ms=5, color=GREY, label=text))
     ax.legend(handles=keys, loc="upper center", bbox_to_anchor=(0.46, -0.16), ncols=2, frameon=False)
     return ax

@@ -40,10 +40,10 @@ LAYERS = (
     ("files",),
     ("report",),
     ("scene_file",),
-    ("run",),
     ("conformance", "conformance_bench", "conformance_terms", "conformance_engines"),
-    ("",),  # `instrument` itself, which looks names up in all of them when they are first used
     ("doctor",),
+    ("run",),
+    ("",),  # `instrument` itself, which looks names up in all of them when they are first used
     ("cli",),
 )
 # (importer, imported): why this one import inside a function may run back

@@ -105,7 +105,7 @@ def test_sources_near_a_null_are_not_coloured_and_are_named_in_the_legend():
     # the leakage drawn is 1 % a degree
     np.testing.assert_allclose(np.sort(measured.get_array()), np.sort(shown), atol=1e-12)
     texts = [t.get_text() for t in measured.axes.get_legend().get_texts()]
-    assert texts == ["near a null: not measured (3)"]
+    assert texts == ["not measured: near a null, or too faint (3)"]
 
 
 def test_bubbles_lie_east_to_the_left_at_their_true_distance():
