@@ -47,6 +47,8 @@ _HOME = {
     "Calibrator": "calibrate.base",
     "Solution": "calibrate.base",
     "SelfCal": "calibrate.selfcal",
+    "read_h5parm": "files.solutions",
+    "write_h5parm": "files.solutions",
     "Imager": "image.dirty",
     "StokesCube": "image.cube",
     "Analyzer": "analyze.analyzer",

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
 
-from instrument.errors import InputError, did_you_mean
+from instrument.errors import InputError, InstrumentWarning, did_you_mean
 from instrument.image.cube import StokesCube
 from instrument.units import Complex, Float, Int, to_si
 
@@ -77,10 +78,9 @@ class Spectrum2D:
 
 def ratio(a: Spectrum2D, b: Spectrum2D) -> Float:
     """Power of `a` over that of `b` (N,): the PSF cancels. NaN where a bin is empty or `b` is zero; same bins only."""
-    if a.edges.shape != b.edges.shape or not np.allclose(a.edges, b.edges, rtol=1e-9, atol=0):
-        raise InputError("the two spectra have different bins: make both with the same uv_range, bins and redshift")
-    if a.unit != b.unit:
-        raise InputError(f"the two spectra have different units: {a.unit} and {b.unit}")
+    same = a.edges.shape == b.edges.shape and np.allclose(a.edges, b.edges, rtol=1e-9, atol=0)
+    if not same or a.unit != b.unit:
+        raise InputError("spectra differ in bins or unit: make both with the same uv_range, bins, redshift, and unit")
     return np.divide(a.power, b.power, out=np.full(len(a.power), np.nan), where=b.power > 0)
 
 
@@ -96,23 +96,25 @@ def spectrum_2d(
     cosmology: Any = None,
 ) -> Spectrum2D:
     """Spectrum of one plane of a cube; see `Analyzer.spectrum_2d`."""
-    image = plane(cube, stokes, channel)
-    has = ~np.isnan(image)
+    has = ~np.isnan(image := plane(cube, stokes, channel))
     window = has * np.multiply.outer(*(taper_of(n, taper) for n in image.shape))
     if np.isinf(image).any():
         raise InputError(f"{stokes} of channel {channel} has {np.isinf(image).sum()} infinite pixels: make them NaN")
     if not window.any():
-        raise InputError(f"{stokes} of channel {channel} is NaN wherever the taper is not 0: there is no data")
+        raise InputError(f"{stokes} of channel {channel} has no data: all NaN, or NaN where the taper is not 0")
+    if not has.all():
+        text = f"{1 - has.mean():.2g} of the pixels are NaN and count as zero: rims of holes scatter steep spectra"
+        warnings.warn(text, InstrumentWarning, stacklevel=3)
     # no interferometer sees the mean, and a taper or a hole would spread it over the first cells
     variance, times = cell_variance(np.where(has, image - image[has].mean(), 0.0), window)
     v, u = (np.fft.fftfreq(n, cube.pixel_rad) for n in image.shape)
     uv = np.hypot(v[:, None], u[: variance.shape[1]])
-    z, distance = comoving(float(cube.freq_hz[channel]), redshift, cosmology)
-    low, high = (0.0, np.inf) if uv_range is None else (float(x) for x in uv_range)
-    if not 0 <= low < high:
+    z, distance = comoving(cube.freq_hz[channel], redshift, cosmology)
+    cut = np.asarray((0, np.inf) if uv_range is None else uv_range, float)
+    if cut.shape != (2,) or not 0 <= cut[0] < cut[1]:
         raise InputError(f"uv_range = {uv_range} must be two numbers of wavelengths, the smaller one first")
-    use = (uv > 0) & (uv >= low) & (uv <= high)
-    if not use.any():
+    low, high = cut.tolist()
+    if not (use := (uv > 0) & (uv >= low) & (uv <= high)).any():
         raise InputError(f"uv_range = {uv_range} holds no cell of an image of {image.shape[1]} x {image.shape[0]}")
     uv, weight = uv[use], np.broadcast_to(times, use.shape)[use]
     scale, top = 2 * np.pi / distance, uv.max() if high == np.inf else high
@@ -121,11 +123,11 @@ def spectrum_2d(
     power = mean * image.size * (distance * cube.pixel_rad) ** 2  # area / pixels^2 |DFT|^2
     # a window makes neighbouring cells alike: mean(w^4)/mean(w^2)^2 of them are one
     modes = count * (1.0 if stokes == "P" else 0.5)
-    effective = np.maximum(modes * (window**2).mean() ** 2 / (window**4).mean(), np.minimum(modes, 1))
-    sigma = power / np.sqrt(effective)
-    cut, missing = (None if uv_range is None else (low, high)), 1 - float(has.mean())
-    source = cube.unit, stokes, float(cube.freq_hz[channel]), z, distance
-    return Spectrum2D(k_mean, uv_mean, power, sigma, count, edges, *source, cut, taper, missing)
+    modes = np.maximum(modes * (window**2).mean() ** 2 / (window**4).mean(), np.minimum(modes, 1))
+    about = cube.unit, stokes, float(cube.freq_hz[channel]), z, distance, uv_range and (low, high), taper
+    return Spectrum2D(
+        k_mean, uv_mean, power, power / np.sqrt(modes), count, edges, *about, missing=1 - float(has.mean())
+    )
 
 
 def plane(cube: StokesCube, stokes: str, channel: int) -> Float | Complex:
@@ -172,19 +174,17 @@ def comoving(freq_hz: float, redshift: float | None, cosmology: Any) -> tuple[fl
         raise InputError(f"redshift = {z:.4g} for {freq_hz / 1e6:.6g} MHz is not above 0: give redshift=")
     if not isinstance(cosmology, FLRW | None):
         raise InputError(f"cosmology = {cosmology!r} is not one of astropy.cosmology, such as Planck18")
-    return z, float((cosmology or Planck15).comoving_transverse_distance(z).to_value("Mpc"))
+    return float(z), float((cosmology or Planck15).comoving_transverse_distance(z).to_value("Mpc"))
 
 
 def bin_edges(low: float, high: float, bins: Any, log: bool) -> Float:
     """Edges in 1/Mpc (N + 1,): `bins` of them, equal in ln k or in k, or the edges given with their unit."""
     if isinstance(bins, int | np.integer):
-        if bins < 1:
-            raise InputError(f"bins = {bins}: at least one is needed")
-        edges = (np.geomspace if log else np.linspace)(low, high, int(bins) + 1)
+        edges = (np.geomspace if log else np.linspace)(low, high, max(int(bins), 0) + 1)
     else:
         edges = np.atleast_1d(to_si(bins, "1/Mpc", "bins"))
     if edges.ndim != 1 or len(edges) < 2 or not (np.diff(edges) > 0).all() or edges[0] < 0:
-        raise InputError(f"edges of bins from {edges.min():.4g} to {edges.max():.4g} /Mpc do not grow from 0 or more")
+        raise InputError(f"bins = {bins} (from {low:.4g} to {high:.4g} /Mpc) are not one or more, or edges that grow")
     return np.asarray(edges)
 
 

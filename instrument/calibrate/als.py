@@ -142,5 +142,6 @@ def stations_of(antenna1: Int, antenna2: Int, weight: Any, stations: int) -> Any
     per_baseline = weight.reshape(len(weight), -1, count).sum(axis=1)
     out = np.zeros((len(weight), stations))
     for ends in (antenna1, antenna2):
-        np.add.at(out, (slice(None), ends), per_baseline)
+        rows: Any = slice(None)
+        np.add.at(out, (rows, ends), per_baseline)
     return out > 0

@@ -90,6 +90,8 @@ def pair(data: Visibilities, model: Visibilities) -> tuple[Complex, Complex, Flo
 
     Raises when coordinates or beam states differ.
     """
+    if data.data.shape != model.data.shape:
+        raise InputError(f"data and model do not pair: they have shapes {data.data.shape} and {model.data.shape}")
     data - replace(model, data=data.data)  # checks coordinates and beam states
     weight = np.broadcast_to(data.effective_weight, data.data.shape[:3])
     return data.data, model.data, weight

@@ -1,0 +1,298 @@
+"""DirectionalCal: a matrix per station, interval and cluster of directions, all clusters solved at once."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Collection, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BeforeValidator, Field
+
+from instrument.calibrate.base import Calibrator, Solution, pair
+from instrument.calibrate.clusters import Block, Limits
+from instrument.calibrate.gauge import gauge_of
+from instrument.errors import InputError, InstrumentError, Outcome, did_you_mean
+from instrument.jones.base import JonesTerm
+from instrument.jones.table import JonesTable
+from instrument.units import Complex, Float, Int, Metres, Seconds, to_si
+from instrument.visibilities import Visibilities
+
+Models = Mapping[str, Visibilities]
+
+
+@dataclass(frozen=True, eq=False)
+class DirectionalSolution:
+    """A `Solution` for each cluster, by name: `solution["3C196"].term` is the station term of that direction."""
+
+    clusters: dict[str, Solution]
+
+    def __getitem__(self, name: str) -> Solution:
+        if name not in self.clusters:
+            raise InputError(f"no cluster '{name}': {did_you_mean(name, self.clusters)}")
+        return self.clusters[name]
+
+    def predicted(self, models: Models, keep: Collection[str] = ()) -> Visibilities:
+        """The sum over clusters of J_a^c M_ab^c J_b^cH, without those in `keep`; flagged where a solution is missing."""
+        for name in (*self.clusters, *keep):
+            if name not in models:
+                raise InputError(f"no model of cluster '{name}': {did_you_mean(name, models)}")
+        first = next(iter(models.values()))
+        total = replace(first, data=np.zeros_like(first.data, complex))
+        for name in self.clusters:
+            if name not in keep:
+                total = _plus(total, models[name], self[name].term)
+        return total
+
+    def subtracted(self, data: Visibilities, models: Models, keep: Collection[str] = ()) -> Visibilities:
+        """The data without the clusters (except those in `keep`); zero and flagged where a solution is missing."""
+        model = self.predicted(models, keep)
+        bad = (model.flag & ~data.flag) | ~np.isfinite(data.data).all(axis=(-2, -1))
+        empty = np.broadcast_to(bad, data.data.shape[:3])[..., None, None]
+        left = data.with_data(np.where(empty, 0.0, data.data)).flagged(bad) - model
+        return replace(left, data=np.where(empty, 0.0, left.data))
+
+    def check(self) -> None:
+        """Raise `InstrumentError` when an interval of a cluster has not converged."""
+        for name, solution in self.clusters.items():
+            try:
+                solution.check()
+            except InstrumentError as error:
+                raise InstrumentError(f"cluster '{name}': {error}") from None
+
+    def __str__(self) -> str:
+        return "\n".join(f"{name}: {solution}" for name, solution in self.clusters.items())
+
+
+def _plus(total: Visibilities, model: Visibilities, term: JonesTerm) -> Visibilities:
+    """The sum of visibilities and a corrupted model. Where the model is zero, no solution is needed."""
+    if not np.isfinite(model.data).all():
+        model = replace(model, data=np.where(np.isfinite(model.data), model.data, np.nan + 0j))
+    empty = np.all(model.data == 0, axis=(-2, -1))
+    found = model.corrupted(term).data
+    bad = ~np.isfinite(found).all(axis=(-2, -1)) & ~empty
+    found = np.where((bad | empty)[..., None, None], 0.0, found)
+    return replace(total, data=total.data + found, flag=total.flag | bad)
+
+
+def _seconds_by_name(given: Any) -> Any:
+    """Times by name, each written with its unit: what a component can store and read again."""
+    if not isinstance(given, Mapping):
+        raise InputError(f"intervals takes a dict of cluster names and times, got {given!r}")
+    seconds = {name: to_si(value, "s", f"intervals['{name}']") for name, value in given.items()}
+    for name, value in seconds.items():
+        if not (np.ndim(value) == 0 and np.isfinite(value) and value > 0):
+            raise InputError(f"intervals['{name}'] = {value} s must be one positive time")
+    return {name: f"{value!r} s" for name, value in seconds.items()}
+
+
+class DirectionalCal(Calibrator):
+    """Direction-dependent solve of V_ab = sum_c J_a^c M_ab^c J_b^cH for all clusters c at once.
+
+    `pattern` as in `SelfCal`; `interval` (each integration by default) holds for all clusters, `intervals` names
+    others for some. `robust` is the degrees of freedom of Student's t: visibilities with outliers (interference,
+    sources that no model has) then weigh (nu + 8) / (nu + |r|^2 / sigma^2), sigma being measured; None: Gaussian noise.
+    `min_baseline` leaves out shorter ones. `start` is a term to start all clusters from, a `SelfCal` solution say; the
+    identity otherwise. Stops when no matrix changes by more than `tolerance` of itself. Memory: each baseline twice,
+    times clusters and one more, in every thread.
+    """
+
+    pattern: Literal["full", "diagonal", "scalar", "phase"] = "full"
+    interval: Annotated[Seconds | None, Field()] = None
+    intervals: Annotated[dict[str, str], BeforeValidator(_seconds_by_name)] = {}  # noqa: RUF012 - pydantic copies it
+    channels: Annotated[int, Field(ge=1)] = 1
+    robust: Annotated[float | None, Field(gt=0)] = None
+    tolerance: Annotated[float, Field(gt=0, lt=0.1)] = 1e-8
+    iterations: Annotated[int, Field(ge=1)] = 100
+    min_baseline: Metres | None = None
+    unexplained: Annotated[float, Field(gt=0, le=1)] = 0.7
+    start: JonesTerm | None = None
+
+    def solve(self, data: Visibilities, models: Models) -> DirectionalSolution:  # type: ignore[override]
+        """Solve every interval; flagged and non-finite data weigh nothing. `models`: one `Visibilities` per cluster."""
+        names = self._names(models)
+        weight = pair(data, models[names[0]])[2]
+        for name in names[1:]:
+            pair(data, models[name])
+        weight = self._cut(data, weight)
+        stacked = np.stack([models[name].data for name in names])
+        for name, model in zip(names, stacked, strict=True):
+            if not np.any(model):
+                raise InputError(f"the model of cluster '{name}' is zero everywhere: leave it out")
+        grid = _Grid.of(data, [self._seconds(name) for name in names])
+        cells = [(k, f) for k in range(grid.blocks) for f in range(0, data.data.shape[1], self.channels)]
+        job = _Job(self, data, stacked, weight, grid)
+        from threadpoolctl import threadpool_limits
+
+        with threadpool_limits(1), ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+            parts = list(pool.map(lambda cell: job.solve(*cell), cells))
+        return DirectionalSolution({name: job.gathered(c, parts) for c, name in enumerate(names)})
+
+    def _names(self, models: Models) -> list[str]:
+        if not models:
+            raise InputError("models is empty: give at least one cluster, a dict of name and Visibilities")
+        for name in self.intervals:
+            if name not in models:
+                raise InputError(f"intervals names '{name}', which no model is of: {did_you_mean(name, models)}")
+        return list(models)
+
+    def _seconds(self, name: str) -> float | None:
+        return to_si(self.intervals[name], "s") if name in self.intervals else self.interval
+
+    def _cut(self, data: Visibilities, weight: Float) -> Float:
+        ends = np.stack([data.antenna1, data.antenna2])
+        if len(np.unique(np.sort(ends, axis=0), axis=1).T) != ends.shape[1]:
+            raise InputError("a baseline occurs twice in the data: a directional solve needs each once")
+        weight = np.where(ends[0] == ends[1], 0.0, weight)
+        if self.min_baseline is None:
+            return weight
+        return weight * (np.linalg.norm(data.uvw_m, axis=-1)[:, None] >= self.min_baseline)
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Integrations counted on a regular grid (gaps count too), and the lengths of all that is made of them."""
+
+    number: Int  # (T,) of the integration, from 0
+    steps: list[int]  # integrations in the interval of each cluster
+    whole: int  # in a block: all clusters begin a new interval with it
+    piece: int  # in a piece: no cluster begins a new interval within it
+    first_s: float
+    interval_s: float
+
+    @classmethod
+    def of(cls, data: Visibilities, seconds: Iterable[float | None]) -> _Grid:
+        slots = data.at.slots_s
+        if np.any(np.diff(slots) <= 0) or np.any(np.diff(data.at.freq_hz) <= 0):
+            raise InputError("a solve needs times and channels in ascending order")
+        if not data.interval_s > 0:
+            raise InputError(f"the integrations of the data last {data.interval_s} s: they must be positive")
+        number = np.round((slots - slots[0]) / data.interval_s).astype(int)
+        span = int(number[-1]) + 1
+        steps = [1 if s is None else min(span, max(1, round(s / data.interval_s))) for s in seconds]
+        return cls(number, steps, math.lcm(*steps), math.gcd(*steps), float(slots[0]), data.interval_s)
+
+    @property
+    def blocks(self) -> int:
+        return int(self.number[-1]) // self.whole + 1
+
+    def known(self, cluster: int) -> Int:
+        """Numbers of the intervals of a cluster that hold data."""
+        return np.unique(self.number // self.steps[cluster])
+
+    def centres_s(self, cluster: int) -> Float:
+        """Centres of those intervals as if they were full: every integration is then nearest to its own."""
+        step = self.steps[cluster]
+        return self.first_s + (self.known(cluster) * step + (step - 1) / 2) * self.interval_s
+
+
+@dataclass
+class _Part:
+    """What came out of one block of K unknown matrices a station and P pieces."""
+
+    cell: tuple[int, int]
+    jones: Complex
+    outcome: list[Outcome]  # (K,)
+    count: int
+    share: Float
+    history: Float
+    column: Int  # (P, C): the unknown that a cluster has in a piece
+    pieces: Int  # (P, C): the interval of the cluster that it belongs to
+
+
+@dataclass
+class _Job:
+    """What all blocks of one solve share."""
+
+    settings: DirectionalCal
+    data: Visibilities
+    models: Complex
+    weight: Float
+    grid: _Grid
+
+    def solve(self, block: int, channel: int) -> _Part:
+        """Solve one block of integrations, and `channels` channels from `channel` on."""
+        settings, grid = self.settings, self.grid
+        rows = np.flatnonzero(grid.number // grid.whole == block)
+        pieces, place = np.unique(grid.number[rows] // grid.piece, return_inverse=True)
+        chosen = [rows[place == k] for k in range(len(pieces))]
+        span = slice(channel, min(channel + settings.channels, self.data.data.shape[1]))
+        first = np.stack([pieces * grid.piece // step for step in grid.steps], axis=1)
+        column, offset = np.zeros_like(first), 0
+        for c in range(first.shape[1]):
+            column[:, c] = np.unique(first[:, c], return_inverse=True)[1] + offset
+            offset = int(column[:, c].max(initial=-1)) + 1
+        limits = Limits(
+            settings.pattern, settings.tolerance, settings.iterations, settings.robust, settings.unexplained
+        )
+        # [piece][time, channel] as samples of pieces of one length, filled up with weight zero
+        weight = _even([self.weight[t, span] for t in chosen])
+        models = np.stack([_even([m[t, span] for t in chosen]) for m in self.models])
+        finite = bool(np.isfinite(models[:, weight > 0]).all())
+        weight = weight if finite else np.zeros_like(weight)
+        solver = Block(
+            data=_even([self.data.data[t, span] for t in chosen]), models=np.where(np.isfinite(models), models, 0.0),
+            weight=weight, a1=self.data.antenna1, a2=self.data.antenna2, stations=len(self.data.layout),
+            column=column, limits=limits,
+        )  # fmt: skip
+        jones, outcome, count, share, history = solver.solve(self._start(rows[:1], span, solver.columns))
+        alive = [Outcome.REFUSED if finite else Outcome.NON_FINITE, outcome]
+        outcomes = [alive[int(any_)] for any_ in solver.active.any(axis=1)]
+        return _Part((block, channel), jones, outcomes, count, share, history, column, first)
+
+    def _start(self, row: Int, span: slice, columns: int) -> Complex:
+        begin = np.zeros((columns, len(self.data.layout), 2, 2), complex)
+        begin[...] = np.eye(2)
+        if self.settings.start is not None and len(row):
+            at = self.data.at.block(slice(row[0], row[0] + 1), slice(span.start, span.start + 1))
+            given = np.broadcast_to(self.settings.start.jones(at)[0, 0, :, 0], begin.shape)
+            begin = np.where(np.isfinite(given).all(axis=(-2, -1))[..., None, None], given, begin)
+        return begin
+
+    def gathered(self, cluster: int, parts: list[_Part]) -> Solution:
+        """The solution of one cluster."""
+        data, settings = self.data, self.settings
+        known = self.grid.known(cluster)
+        firsts = np.arange(0, data.data.shape[1], settings.channels)
+        shape = (len(known), len(firsts))
+        jones = np.full((*shape, len(data.layout), 2, 2), np.nan + 0j)
+        outcome = np.full(shape, Outcome.REFUSED, object)
+        count, share = np.zeros(shape, int), np.full(shape, np.nan)
+        for part in parts:
+            f = part.cell[1] // settings.channels
+            for own in np.unique(part.pieces[:, cluster]):
+                here = part.pieces[:, cluster] == own
+                k = int(part.column[here, cluster][0])
+                t = int(np.searchsorted(known, own))
+                count[t, f], share[t, f] = part.count, np.sqrt(np.mean(part.share[here] ** 2))
+                outcome[t, f] = part.outcome[k]
+                if outcome[t, f] is Outcome.CONVERGED:
+                    jones[t, f] = part.jones[k]
+        longest = max(len(p.history) for p in parts)
+        history = np.stack([np.pad(p.history, (0, longest - len(p.history))) for p in parts]).max(axis=0)
+        return Solution(
+            term=JonesTable(
+                values=jones,
+                slots_s=self.grid.centres_s(cluster),
+                freq_hz=np.array([data.at.freq_hz[f : f + settings.channels].mean() for f in firsts]),
+                stations=tuple(data.layout.names),
+            ),
+            outcome=outcome,
+            iterations=count,
+            residual=share,
+            gauge=gauge_of(self.models[cluster], self.weight, settings.pattern),
+            history=history,
+            interval_s=self.grid.steps[cluster] * data.interval_s,
+        )
+
+
+def _even(pieces: list[Any]) -> Any:
+    """Arrays (t, f, ...) as one (P, s, ...), the short ones filled up with zeros."""
+    flat = [piece.reshape(-1, *piece.shape[2:]) for piece in pieces]
+    out = np.zeros((len(flat), max(len(x) for x in flat), *flat[0].shape[1:]), flat[0].dtype)
+    for row, x in zip(out, flat, strict=True):
+        row[: len(x)] = x
+    return out

@@ -1,0 +1,173 @@
+"""Solutions in and out as h5parm, the layout of DP3 and LoSoTo (see h5parm.py).
+
+Gains multiply there as ours do, V_ab = J_a M J_b^H with rows and columns X, Y = p, q: nothing is conjugated or
+transposed here. Times are MJD seconds, UTC, as ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from instrument import mat2
+from instrument.calibrate.base import Solution
+from instrument.errors import FileError, InputError, did_you_mean
+from instrument.files.h5parm import AXES, KINDS, POLS, one_line, read_soltabs
+from instrument.jones.table import JonesTable
+from instrument.observe.layout import Layout
+from instrument.observe.sampling import Sampling
+from instrument.units import Complex
+
+Pattern = Literal["full", "diagonal", "scalar", "phase"]
+
+
+def write_h5parm(
+    path: Any, solution: Solution | JonesTable, pattern: Pattern = "full", at: Sampling | None = None
+) -> None:
+    """Write a solution as h5parm; `at` (such as `vis.at`) lends names and positions of stations and the phase centre.
+
+    `pattern` "phase" is a phase per receptor, without amplitudes; what a pattern would lose (above 1e-6) raises
+    `InputError`. Matrices that are not finite or have no inverse get weight 0, for DP3 passes a gain of zero on
+    unflagged; they read back as NaN. Positions and phase centre that are not known are NaN.
+    """
+    if pattern not in POLS:
+        raise InputError(f"no pattern '{pattern}': {did_you_mean(pattern, POLS)}")
+    table = solution.term if isinstance(solution, Solution) else solution
+    names = table.stations or (at.layout.names if at is not None else ())
+    if not names:
+        raise InputError("the table names no stations; give at=vis.at")
+    if at is not None and at.layout.names != names:
+        raise InputError("the table is of other stations than `at`, or in another order")
+    values = np.asarray(table.values)
+    if values.shape[2] not in (1, len(names)):
+        raise InputError(f"the table holds {values.shape[2]} stations, but `at` {len(names)}")
+    values = np.broadcast_to(values, (*values.shape[:2], len(names), 2, 2))
+    usable = np.isfinite(values).all(axis=(-2, -1)) & np.isfinite(mat2.inverse(values)).all(axis=(-2, -1))
+    gains = _in_pattern(values, pattern)
+
+    axes = [*AXES[:3], *(("pol",) if POLS[pattern] else ())]
+    along = {"time": table.slots_s, "freq": table.freq_hz, "ant": _bytes(names), "pol": _bytes(POLS[pattern])}
+    weight = np.broadcast_to(usable[..., None], gains.shape).astype(np.float32)
+    parts = {"amplitude": np.abs(gains), "phase": np.where(np.isfinite(gains), np.angle(gains), np.nan)}
+    now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S")
+    history = f"{now}: CREATE by instrument {metadata.version('instrument')}"
+    if isinstance(solution, Solution):
+        history += f"\n{solution}"
+
+    target = Path(path)
+    partial = target.with_name(target.name + ".part")
+    import h5py
+
+    try:
+        with h5py.File(partial, "w") as store:
+            solset = store.create_group("sol000")
+            solset.attrs["h5parm_version"] = np.bytes_("1.0")
+            solset["antenna"], solset["source"] = _antenna(names, at), _source(at)
+            for kind in KINDS[1:] if pattern == "phase" else KINDS:
+                soltab = solset.create_group(f"{kind}000")
+                soltab.attrs["TITLE"], soltab.attrs["h5parm_version"] = np.bytes_(kind), np.bytes_("1.0")
+                for axis in axes:
+                    soltab[axis] = along[axis]
+                for name, array in (("val", parts[kind]), ("weight", weight)):
+                    soltab[name] = array.reshape([len(along[axis]) for axis in axes])
+                    soltab[name].attrs["AXES"] = np.bytes_(",".join(axes))
+                soltab["val"].attrs["HISTORY000"] = np.bytes_(history.encode())
+        partial.replace(target)
+    except OSError as error:
+        raise FileError(f"{path} cannot be written: {one_line(error)}") from None
+
+
+def read_h5parm(
+    path: Any,
+    layout: Layout | None = None,
+    direction: str | None = None,
+    solset: str | None = None,
+    soltabs: Sequence[str] | None = None,
+    missing: Literal["error", "flag"] = "error",
+) -> JonesTable:
+    """Jones matrices (t, f, A, 2, 2) of the amplitudes and phases of an h5parm; NaN where flagged, or of weight 0.
+
+    `layout` puts the stations in its order; one that the file lacks raises, or is NaN with `missing` "flag".
+    `direction` picks one of several (a name, with or without its brackets); `solset` and `soltabs` choose when there is
+    more than one solset, or more tables than one of amplitudes and one of phases. Raises `FileError` that names file,
+    group and what is wrong.
+    """
+    if missing not in ("error", "flag"):
+        raise InputError(f"missing = '{missing}' must be 'error' or 'flag'")
+    where, tables = read_soltabs(path, solset, soltabs, direction)
+    first = tables[0]
+    for other in tables[1:]:
+        for axis in AXES[:3]:
+            if not np.array_equal(first.along[axis], other.along[axis]):
+                raise FileError(f"{where}: {first.name} and {other.name} differ in axis '{axis}'; put them on one grid")
+    parts = {table.kind: table.values for table in tables}
+    counts = {kind: part.shape[-1] for kind, part in parts.items()}
+    if 4 in counts.values() and list(counts.values()) != [4, 4]:
+        raise FileError(f"{where}: full Jones needs XX, XY, YX and YY of both an amplitude and a phase")
+    gains = parts.get("amplitude", 1.0) * np.exp(1j * parts.get("phase", 0.0))
+    values, stations = _matrices(gains), tuple(first.along["ant"])
+    if layout is not None:
+        values, stations = _in_order(where, values, stations, layout, missing), layout.names
+    try:
+        return JonesTable(values=values, slots_s=first.along["time"], freq_hz=first.along["freq"], stations=stations)
+    except InputError as error:
+        raise FileError(f"{where}: {error}") from None
+
+
+def _in_pattern(values: Complex, pattern: Pattern) -> Complex:
+    """The entries (..., P) that a pattern keeps of matrices (..., 2, 2); raises when it would lose others."""
+    flat = values.reshape(*values.shape[:3], 4)
+    if pattern == "full":
+        return flat
+    kept = flat[..., [0]] if pattern == "scalar" else flat[..., [0, 3]]
+    if pattern == "phase":
+        kept = np.exp(1j * np.angle(kept))
+    change = np.abs(_matrices(kept) - values)
+    lost, size = (np.nanmax(x, initial=0.0, where=np.isfinite(x)) for x in (change, np.abs(values)))
+    if lost > 1e-6 * size:
+        raise InputError(f"pattern '{pattern}' would lose entries of up to {lost:.3g} of {size:.3g}; use 'full'")
+    return kept
+
+
+def _matrices(gains: Any) -> Complex:
+    """Matrices (..., 2, 2) of gains (..., P): P = 1 a scalar, 2 a diagonal, 4 all."""
+    if gains.shape[-1] == 4:
+        return gains.reshape(*gains.shape[:-1], 2, 2)
+    out = np.zeros((*gains.shape[:-1], 2, 2), complex)
+    out[..., 0, 0], out[..., 1, 1] = gains[..., 0], gains[..., -1]
+    return out
+
+
+def _bytes(names: Sequence[str]) -> Any:
+    """Names as HDF5 text. One byte more than the longest: DP3 takes the last one for the end of the text."""
+    coded = [name.encode() for name in names]
+    return np.array(coded, f"S{max(map(len, coded), default=0) + 1}")
+
+
+def _antenna(names: Sequence[str], at: Sampling | None) -> Any:
+    coded = _bytes(names)
+    out = np.zeros(len(names), [("name", f"S{max(16, coded.dtype.itemsize)}"), ("position", np.float32, 3)])
+    out["name"], out["position"] = coded, np.nan if at is None else at.layout.positions_m
+    return out
+
+
+def _source(at: Sampling | None) -> Any:
+    out = np.zeros(1, [("name", "S128"), ("dir", np.float64, 2)])
+    out["name"], out["dir"] = b"POINTING", np.nan if at is None else (at.centre.ra_rad, at.centre.dec_rad)
+    return out
+
+
+def _in_order(where: str, values: Complex, names: Sequence[str], layout: Layout, missing: str) -> Complex:
+    lacking = [name for name in layout.names if name not in names]
+    if lacking and (missing == "error" or len(lacking) == len(layout)):
+        more = f" and {len(lacking) - 1} more" if len(lacking) > 1 else ""
+        raise FileError(f"{where}: no station '{lacking[0]}'{more}: {did_you_mean(lacking[0], names)}")
+    rows = [names.index(name) if name in names else -1 for name in layout.names]
+    out = values[:, :, rows]
+    out[:, :, [row < 0 for row in rows]] = np.nan
+    return out
