@@ -46,6 +46,7 @@ _HOME = {
     "JonesTable": "jones.table",
     "Calibrator": "calibrate.base",
     "Solution": "calibrate.base",
+    "Spectrum2D": "analyze.spectra",
     "SelfCal": "calibrate.selfcal",
     "read_h5parm": "files.solutions",
     "write_h5parm": "files.solutions",

@@ -265,9 +265,12 @@ def _rounding(problem: Problem) -> float:
     """Bound on the rounding of float64 phases and sums, relative to the total flux."""
     eps = float(np.finfo(float).eps)
     reach = np.abs(problem.at.lmn).max(axis=0).sum() if len(problem.at.lmn) else 0.0
-    turns = problem.at.layout.longest_m * float(problem.at.freq_hz.max()) / LIGHT * float(reach)
-    # 4 roundings in each of two phases; 30 in the Jones matrices; the sum itself over S sources, worst case
-    return eps * (2 * np.pi * 8 * turns + 30 + problem.at.shape[3])
+    waves = problem.at.layout.longest_m * float(problem.at.freq_hz.max()) / LIGHT
+    gain = problem.chain.peak(problem.at) ** 2
+    # 4 roundings in each of two phases, and 4 of direction cosines, which are good to eps of 1 and not of themselves;
+    # 30 in the Jones matrices; the sum itself over S sources, worst case. Gains above 1 amplify it
+    largest = max(1.0, gain) if np.isfinite(gain) else 1.0
+    return largest * eps * (2 * np.pi * (8 * waves * float(reach) + 4 * waves) + 30 + problem.at.shape[3])
 
 
 def _total_flux(problem: Problem) -> float:

@@ -6,6 +6,7 @@ import os
 import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
+from datetime import date, datetime
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -14,6 +15,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from instrument.analyze.photometry import ForcedPhotometry
+from instrument.calibrate.selfcal import SelfCal
 from instrument.component import Component
 from instrument.errors import FileError, InputError, did_you_mean
 from instrument.image.dirty import Imager
@@ -27,7 +29,7 @@ from instrument.scene import Scene
 from instrument.sky.base import Sky
 from instrument.units import Float, Hertz, HertzArray, Instant, Jansky, Seconds, SkyDirection
 
-STAGES = ("noise", "correct", "image", "analyze")
+STAGES = ("noise", "calibrate", "correct", "image", "analyze")
 SEED_STEP = 1000  # seeds of the stages of a scene are derived from its one seed
 
 
@@ -89,7 +91,7 @@ class CorrectTable(Component):
 class AnalyzeTable(Component):
     """The table [analyze]: which products, and the settings of forced photometry."""
 
-    products: tuple[Literal["leakage"], ...] = ("leakage",)
+    products: tuple[Literal["leakage", "spectrum-2d"], ...] = ("leakage",)
     uv_range: tuple[float, float] | None = None
     every: int = Field(default=1, ge=1)
 
@@ -103,13 +105,14 @@ class SceneFile(Component):
 
     name: str
     title: str = ""
-    seed: int = 0
+    seed: int = Field(default=0, ge=0)
     tolerance: float = Field(default=0.0, ge=0)
     engine: str | None = None
     instrument: dict[str, Any]
     observation: ObservationTable
     sky: dict[str, Any]
     noise: NoiseTable | None = None
+    calibrate: dict[str, Any] | None = None
     correct: CorrectTable | None = None
     image: Imager | None = None
     analyze: AnalyzeTable | None = None
@@ -118,6 +121,8 @@ class SceneFile(Component):
     def _stages_fit(self) -> Self:
         if not self.name or any(c in self.name for c in "/\\\0") or self.name.startswith("."):
             raise InputError(f"name = {self.name!r} cannot name a folder")
+        if self.analyze and "spectrum-2d" in self.analyze.products and self.image is None:
+            raise InputError("[analyze] products = ['spectrum-2d'] needs images: give a table [image]")
         if self.noise is not None and self.observation.frequency is None and self.observation.channel_width is None:
             raise InputError("[noise] needs the width of a channel: give channel_width in [observation]")
         return self
@@ -146,6 +151,17 @@ class SceneFile(Component):
             found: Sky = load("skies", kind, **settings)
         return found
 
+    def calibrator(self) -> SelfCal | None:
+        """The solver of the table [calibrate], where there is one."""
+        if self.calibrate is None:
+            return None
+        settings = dict(self.calibrate)
+        kind = settings.pop("kind", None)
+        if kind != "selfcal":
+            raise InputError(f"[calibrate] kind = {kind!r} is not one of: selfcal")
+        with _in_table("calibrate"):
+            return SelfCal(**settings)
+
     def scene(self) -> Scene:
         """The scene: instrument, sky and observation."""
         with _in_table("observation"):
@@ -154,8 +170,11 @@ class SceneFile(Component):
 
     def products_uv_range(self) -> tuple[float, float] | None:
         """The uv range, in wavelengths, that holds all the products asked for; `None` when one needs all baselines."""
+        if self.calibrate is not None:
+            return None  # a solve takes what there is
         ranges = [self.image.uv_range] if self.image else []
-        ranges += [self.analyze.uv_range] if self.analyze and self.analyze.products else []
+        leakage = self.analyze is not None and "leakage" in self.analyze.products
+        ranges += [self.analyze.uv_range] if self.analyze and leakage else []
         given = [r for r in ranges if r is not None]
         if not given or len(given) < len(ranges):
             return None
@@ -212,9 +231,18 @@ def read_tables(scene: str | os.PathLike[str]) -> dict[str, Any]:
             )
         text, label = (files("instrument.scenes") / f"{scene}.toml").read_text(), str(scene)
     try:
-        return tomllib.loads(text)
+        return _plain(tomllib.loads(text))
     except tomllib.TOMLDecodeError as error:
         raise FileError(f"{label}: {error}") from None
+
+
+def _plain(tables: Any) -> Any:
+    """Tables with times written without quotes as text."""
+    if isinstance(tables, dict):
+        return {k: _plain(v) for k, v in tables.items()}
+    if isinstance(tables, list):
+        return [_plain(v) for v in tables]
+    return tables.isoformat() if isinstance(tables, date | datetime) else tables
 
 
 def override(tables: dict[str, Any], settings: Sequence[str]) -> dict[str, Any]:
@@ -228,7 +256,7 @@ def override(tables: dict[str, Any], settings: Sequence[str]) -> dict[str, Any]:
         if not equals or not all(steps):
             raise InputError(f"--set {setting}: write it like --set sky.brightest=500")
         try:
-            value = tomllib.loads(f"value = {text}")["value"]
+            value = _plain(tomllib.loads(f"value = {text}"))["value"]
         except tomllib.TOMLDecodeError:
             value = text.strip()
         table = out

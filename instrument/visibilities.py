@@ -161,23 +161,29 @@ class Visibilities:
         data = mat2.sandwich(inverse[:, :, self._pick(inverse, 1)], self.data, inverse[:, :, self._pick(inverse, 2)])
         flag = self.flag | ~(good[:, :, self._pick(inverse, 1)] & good[:, :, self._pick(inverse, 2)])
         state = self.beam_state
-        if isinstance(term, Towards):
+        beams = [t for t in (term.parts if isinstance(term, Chain) else (term,)) if isinstance(t, Towards)]
+        if beams:
             if state.removed != "nothing":
                 raise BeamStateError(
                     f"a beam has been taken out already ({state}): start from uncorrected visibilities"
                 )
-            state = BeamState("centre", term.direction or self.phase_centre)
+            state = BeamState("centre", beams[0].direction or self.phase_centre)
         return replace(self, data=data, flag=flag, beam_state=state)
 
     def without_beam(self, instrument: Instrument) -> Visibilities:
         """The same with the beam of an instrument towards the phase centre taken out, not its gains and feeds."""
+        if instrument.layout().names != self.layout.names:
+            raise InputError("these visibilities are of other stations than the instrument, or in another order")
         return self.corrected(Towards(chain=instrument.chain().beams()))
 
     def corrupted(self, term: JonesTerm | Chain) -> Visibilities:
         """J_a V J_b^H for a direction-independent term; inverse of `corrected`."""
         jones = self._station_jones(term)
         data = mat2.sandwich(jones[:, :, self._pick(jones, 1)], self.data, jones[:, :, self._pick(jones, 2)])
-        return replace(self, data=data)
+        state = self.beam_state
+        if any(isinstance(t, Towards) for t in (term.parts if isinstance(term, Chain) else (term,))):
+            state = BeamState()
+        return replace(self, data=data, beam_state=state)
 
     def __sub__(self, other: Visibilities) -> Visibilities:
         """Difference of two sets on the same coordinates; raises `BeamStateError` when their beam states differ."""
@@ -185,13 +191,16 @@ class Visibilities:
             raise BeamStateError(f"cannot mix visibilities of {self.beam_state} and of {other.beam_state}")
         same = (
             self.data.shape == other.data.shape
+            and self.phase_centre == other.phase_centre
+            and self.layout.names == other.layout.names
+            and np.array_equal(self.layout.positions_m, other.layout.positions_m)
             and np.array_equal(self.antenna1, other.antenna1)
             and np.array_equal(self.antenna2, other.antenna2)
             and np.array_equal(self.at.slots_s, other.at.slots_s)
             and np.array_equal(self.freq_hz, other.freq_hz)
         )
         if not same:
-            raise InputError("visibilities with different times, channels or baselines cannot be subtracted")
+            raise InputError("visibilities of other times, channels, stations or phase centres cannot be subtracted")
         return replace(self, data=self.data - other.data, flag=self.flag | other.flag)
 
     def _station_jones(self, term: JonesTerm | Chain) -> Complex:

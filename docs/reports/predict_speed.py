@@ -8,18 +8,16 @@ predict_speed.md beside this file.
 """
 
 import argparse
-import importlib.util
 import os
 import platform
-import subprocess
 import sys
 import tempfile
-import time
 from datetime import date
-from importlib.metadata import files, version
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
+from peers import DP3, peer_tools, timed
 
 HERE = Path(__file__).parent
 OURS = """
@@ -28,19 +26,6 @@ from instrument.scene_file import override, parse, read_tables
 plan = parse(override(read_tables("mock-grid"), [f"observation.duration={sys.argv[1]}"])).scene().plan()
 np.save(sys.argv[2], plan.run().data)
 """
-DP3 = "from dp3 import entrypoint; import sys; sys.exit(entrypoint())"
-
-
-def timed(command, environment):
-    """Wall seconds and peak memory in MB of a process."""
-    begin = time.perf_counter()
-    with tempfile.TemporaryFile() as said:
-        child = subprocess.Popen(command, env=environment, stdout=said, stderr=subprocess.STDOUT)
-        _, status, used = os.wait4(child.pid, 0)
-        child.returncode = os.waitstatus_to_exitcode(status)
-        said.seek(0)
-        assert child.returncode == 0, said.read().decode()[-2000:]
-    return time.perf_counter() - begin, used.ru_maxrss / 1e3
 
 
 def main():
@@ -48,16 +33,9 @@ def main():
     parser.add_argument("--times", type=int, default=2874)
     parser.add_argument("--runs", type=int, default=3)
     given = parser.parse_args()
-    spec = importlib.util.spec_from_file_location("lofar_ms", HERE.parents[1] / "tests" / "peers" / "lofar_ms.py")
-    lofar_ms = importlib.util.module_from_spec(spec)
     with tempfile.TemporaryDirectory() as folder:
         folder = Path(folder)
-        import casacore
-
-        (folder / "casarc").write_text(f"measures.directory: {Path(casacore.__file__).parent / 'data'}\n")
-        os.environ["CASARCFILES"] = str(folder / "casarc")
-        os.environ["EVERYBEAM_DATADIR"] = everybeam_data()
-        spec.loader.exec_module(lofar_ms)
+        lofar_ms = peer_tools(folder)
         import casacore.tables as tables
 
         from instrument.scene_file import override, parse, read_tables
@@ -115,12 +93,6 @@ Earth that DP3 works with (see ../conventions.md).
 """
     (HERE / "predict_speed.md").write_text(text)
     print(text)
-
-
-def everybeam_data():
-    """Folder of the coefficients that the everybeam package carries."""
-    found = next(f for f in files("everybeam") if f.name == "HamakerHBACoeff.h5")
-    return str(Path(found.locate()).resolve().parent)
 
 
 if __name__ == "__main__":

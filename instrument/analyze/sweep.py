@@ -84,8 +84,8 @@ class Sweep:
         """Rms of the residual images over that of the true image, Stokes I, first channel (N,); NaN without images."""
         if self.reference is None:
             return np.full(len(self.models), np.nan)
-        whole = np.nanstd(self.reference.data[0, 0])
-        return np.array([np.nanstd(cube.data[0, 0]) for cube in self.residuals]) / whole
+        # plain: an image without any data is NaN all over, and no other has NaN in it
+        return np.array([cube.data[0, 0].std() for cube in self.residuals]) / self.reference.data[0, 0].std()
 
     @property
     def suppression(self) -> Float:
@@ -109,7 +109,10 @@ class Sweep:
         return {n: spectrum_2d(cube, stokes, **settings) for n, cube in cubes}
 
     def table(self) -> Any:
-        """One row a model, an astropy `QTable` with units."""
+        """One row a model, an astropy `QTable` with units; sources near a null of the beam are left out.
+
+        `bright` are the brightest, in the model or not; `bright_flux_rms` is the rms of how much their fluxes change.
+        """
         from astropy import units as u
         from astropy.table import QTable
 
@@ -129,6 +132,8 @@ class Sweep:
                 rows = [scale * row[pick] for row, pick in zip(values, use, strict=True)]
                 out[f"{name}_{what}_median"] = [float(np.median(r)) if r.size else np.nan for r in rows] * unit
                 out[f"{name}_{what}_max"] = [float(r.max()) if r.size else np.nan for r in rows] * unit
+        changes = zip(self.change_jy, bright, strict=True)
+        out["bright_flux_rms"] = [float(np.sqrt(np.mean(row[use] ** 2))) for row, use in changes] * u.Jy
         out["suppression"] = self.suppression
         if self.ghosts:
             out["ghost"] = [g.jy for g in self.ghosts] * u.Jy
@@ -179,9 +184,10 @@ def find_ghosts(cube: StokesCube, sky: PointSky) -> Ghost:
         raise InputError("ghosts are looked for in images with a phase centre and a PSF")
     m, l = ((np.arange(n) - n // 2) * cube.pixel_rad for n in image.shape)
     where = np.stack(np.broadcast_arrays(-l[None], m[:, None]), axis=-1)
-    near = KDTree(lmn(sky.vectors, cube.centre)[:, :2]).query(where)[0] <= float(cube.psf.major_rad[0])
-    away = np.where(near | ~np.isfinite(image), 0.0, np.abs(image))
-    if near.all():
+    free = KDTree(lmn(sky.vectors, cube.centre)[:, :2]).query(where)[0] > float(cube.psf.major_rad[0])
+    free &= np.isfinite(image)
+    away = np.where(free, np.abs(image), -1.0)
+    if not free.any():
         return Ghost(np.nan, np.nan, np.nan)
     spot = np.unravel_index(np.argmax(away), image.shape)
     ra, dec = offset(cube.centre, *np.moveaxis(where[spot][None], -1, 0))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,6 +15,7 @@ from instrument.calibrate.gauge import Gauge
 from instrument.component import Component
 from instrument.errors import InputError, InstrumentError, Outcome
 from instrument.jones.base import JonesTerm
+from instrument.jones.chain import Chain
 from instrument.jones.table import JonesTable
 from instrument.observe.sampling import Sampling
 from instrument.units import Complex, Float, Int
@@ -54,7 +56,7 @@ class Solution:
             ways = "; ".join(f"{count} {outcome.value}" for outcome, count in ended.most_common())
             raise InstrumentError(f"{sum(ended.values())} of {self.outcome.size} intervals did not converge: {ways}")
 
-    def truth(self, term: JonesTerm, at: Sampling) -> Complex:
+    def truth(self, term: JonesTerm | Chain, at: Sampling) -> Complex:
         """The matrices (t, f, A, 2, 2) of another term at the centres of the intervals; `at` lends the array."""
         where = replace(at, slots_s=self.term.slots_s, freq_hz=self.term.freq_hz)
         found = term.jones(where)[:, :, :, 0]
@@ -67,6 +69,23 @@ class Solution:
             raise InputError(f"the matrices to align to have shape {to.shape}, the solution {self.jones.shape}")
         turned = mat2.mul(self.jones, self.gauge.nearest(self.jones, to)[:, :, None])
         return replace(self, term=self.term.with_fields(values=turned))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Solution]) -> Solution:
+        """Solutions of blocks as one: blocks of the same channels, in order of time."""
+        tables = [p.term for p in parts]
+        longest = max(len(p.history) for p in parts)
+        history = np.stack([np.pad(p.history, (0, longest - len(p.history))) for p in parts]).max(axis=0)
+        values, slots = (np.concatenate([getattr(t, k) for t in tables]) for k in ("values", "slots_s"))
+        return cls(
+            term=tables[0].with_fields(values=values, slots_s=slots),
+            outcome=np.concatenate([p.outcome for p in parts]),
+            iterations=np.concatenate([p.iterations for p in parts]),
+            residual=np.concatenate([p.residual for p in parts]),
+            gauge=parts[0].gauge,
+            history=history,
+            interval_s=parts[0].interval_s,
+        )
 
     def __str__(self) -> str:
         times, channels = self.outcome.shape

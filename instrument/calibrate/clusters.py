@@ -39,8 +39,8 @@ class Limits:
 class Block:
     """Data of one stretch, cut in P pieces of s samples within which no solution changes.
 
-    data (P, s, B, 2, 2), models (C, P, s, B, 2, 2), weight (P, s, B); `column` (P, C) names the unknown, 0 ... K-1, that
-    a cluster has in a piece. Each baseline is held twice, seen from either end.
+    data (P, s, B, 2, 2), models (C, P, s, B, 2, 2), weight (P, s, B); `column` (P, C) names the unknown, 0 ... K-1,
+    that a cluster has in a piece. Each baseline is held twice, seen from either end.
     """
 
     data: Complex
@@ -79,8 +79,10 @@ class Block:
     def solve(self, jones: Complex) -> tuple[Complex, Outcome, int, Float, Float]:
         """Matrices (K, A, 2, 2), outcome, rounds, share of the rms left in each piece (P,), step of each round."""
         limits = self.limits
-        if not self.active.any():
-            return np.full_like(jones, np.nan), Outcome.REFUSED, 0, np.full(len(self.v), np.nan), np.zeros(0)
+        empty = not self.active.any()
+        if empty or 4 * int((self.w > 0).sum()) < UNKNOWNS[limits.pattern] * int(self.active.sum()):
+            nothing = np.full_like(jones, np.nan), np.full(len(self.v), np.nan)
+            return nothing[0], Outcome.REFUSED if empty else Outcome.SINGULAR, 0, nothing[1], np.zeros(0)
         live = self.active.T[:, None, :, None]
         x = np.where(live, jones.transpose(1, 2, 0, 3), 0.0)
         z, left = self._seen(x)
@@ -167,13 +169,8 @@ class Block:
             return np.sqrt(one / whole)
 
     def _singular(self, x: Complex) -> bool:
-        """Whether the data do not tell the unknowns apart: too few, or clusters alike where the stations are.
-
-        Alike as models, for then their matrices mix freely; or alike once corrupted.
-        """
-        if 4 * int((self.w > 0).sum()) < UNKNOWNS[self.limits.pattern] * int(self.active.sum()):
-            return True
-        plain = np.broadcast_to(np.eye(2)[None, :, None, :], x.shape) * self.active.T[:, None, :, None]
+        """Whether clusters are alike, as models (then their matrices mix freely) or once corrupted."""
+        plain: Complex = np.eye(2)[None, :, None, :] * self.active.T[:, None, :, None] + 0j
         each = (_scaled(_Equations(self, y, self._seen(y)[0], self.w).normal)[0] for y in (plain, x))
         return any(bool(np.linalg.eigvalsh(n).min() < COINCIDENT) for n in each)
 

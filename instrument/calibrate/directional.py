@@ -36,7 +36,7 @@ class DirectionalSolution:
         return self.clusters[name]
 
     def predicted(self, models: Models, keep: Collection[str] = ()) -> Visibilities:
-        """The sum over clusters of J_a^c M_ab^c J_b^cH, without those in `keep`; flagged where a solution is missing."""
+        """The sum of J_a^c M_ab^c J_b^cH over clusters not in `keep`; flagged where a solution is missing."""
         for name in (*self.clusters, *keep):
             if name not in models:
                 raise InputError(f"no model of cluster '{name}': {did_you_mean(name, models)}")
@@ -96,8 +96,9 @@ class DirectionalCal(Calibrator):
     others for some. `robust` is the degrees of freedom of Student's t: visibilities with outliers (interference,
     sources that no model has) then weigh (nu + 8) / (nu + |r|^2 / sigma^2), sigma being measured; None: Gaussian noise.
     `min_baseline` leaves out shorter ones. `start` is a term to start all clusters from, a `SelfCal` solution say; the
-    identity otherwise. Stops when no matrix changes by more than `tolerance` of itself. Memory: each baseline twice,
-    times clusters and one more, in every thread.
+    identity otherwise. Stops when no matrix changes by more than `tolerance` of itself. A fit that leaves more than
+    `unexplained` of the rms of the data is `Outcome.POOR_FIT`. Memory: each baseline twice, for every cluster and the
+    data, in every thread.
     """
 
     pattern: Literal["full", "diagonal", "scalar", "phase"] = "full"
@@ -114,16 +115,17 @@ class DirectionalCal(Calibrator):
     def solve(self, data: Visibilities, models: Models) -> DirectionalSolution:  # type: ignore[override]
         """Solve every interval; flagged and non-finite data weigh nothing. `models`: one `Visibilities` per cluster."""
         names = self._names(models)
-        weight = pair(data, models[names[0]])[2]
-        for name in names[1:]:
-            pair(data, models[name])
-        weight = self._cut(data, weight)
-        stacked = np.stack([models[name].data for name in names])
+        with np.errstate(invalid="ignore"):  # data may hold infinities
+            paired = [pair(data, models[name]) for name in names]
+        weight = self._cut(data, paired[0][2])
+        stacked = np.stack([m for _, m, _ in paired])
         for name, model in zip(names, stacked, strict=True):
             if not np.any(model):
                 raise InputError(f"the model of cluster '{name}' is zero everywhere: leave it out")
         grid = _Grid.of(data, [self._seconds(name) for name in names])
-        cells = [(k, f) for k in range(grid.blocks) for f in range(0, data.data.shape[1], self.channels)]
+        if self.channels > data.data.shape[1]:
+            raise InputError(f"channels = {self.channels} of one solution, but the data have {data.data.shape[1]}")
+        cells = [(int(k), f) for k in grid.blocks for f in range(0, data.data.shape[1], self.channels)]
         job = _Job(self, data, stacked, weight, grid)
         from threadpoolctl import threadpool_limits
 
@@ -176,8 +178,9 @@ class _Grid:
         return cls(number, steps, math.lcm(*steps), math.gcd(*steps), float(slots[0]), data.interval_s)
 
     @property
-    def blocks(self) -> int:
-        return int(self.number[-1]) // self.whole + 1
+    def blocks(self) -> Int:
+        """Numbers of the blocks that hold data."""
+        return np.unique(self.number // self.whole)
 
     def known(self, cluster: int) -> Int:
         """Numbers of the intervals of a cluster that hold data."""
@@ -186,7 +189,7 @@ class _Grid:
     def centres_s(self, cluster: int) -> Float:
         """Centres of those intervals as if they were full: every integration is then nearest to its own."""
         step = self.steps[cluster]
-        return self.first_s + (self.known(cluster) * step + (step - 1) / 2) * self.interval_s
+        return np.asarray(self.first_s + (self.known(cluster) * step + (step - 1) / 2) * self.interval_s, float)
 
 
 @dataclass
@@ -240,7 +243,7 @@ class _Job:
         )  # fmt: skip
         jones, outcome, count, share, history = solver.solve(self._start(rows[:1], span, solver.columns))
         alive = [Outcome.REFUSED if finite else Outcome.NON_FINITE, outcome]
-        outcomes = [alive[int(any_)] for any_ in solver.active.any(axis=1)]
+        outcomes = [alive[int(row.any())] for row in solver.active]
         return _Part((block, channel), jones, outcomes, count, share, history, column, first)
 
     def _start(self, row: Int, span: slice, columns: int) -> Complex:
@@ -249,27 +252,29 @@ class _Job:
         if self.settings.start is not None and len(row):
             at = self.data.at.block(slice(row[0], row[0] + 1), slice(span.start, span.start + 1))
             given = np.broadcast_to(self.settings.start.jones(at)[0, 0, :, 0], begin.shape)
-            begin = np.where(np.isfinite(given).all(axis=(-2, -1))[..., None, None], given, begin)
+            good: Any = np.isfinite(given).all(axis=(-2, -1))
+            begin = np.where(good[..., None, None], given, begin)
         return begin
 
     def gathered(self, cluster: int, parts: list[_Part]) -> Solution:
         """The solution of one cluster."""
-        data, settings = self.data, self.settings
+        data, settings, freqs = self.data, self.settings, self.data.at.freq_hz
         known = self.grid.known(cluster)
-        firsts = np.arange(0, data.data.shape[1], settings.channels)
+        firsts = np.arange(0, len(freqs), settings.channels)
         shape = (len(known), len(firsts))
         jones = np.full((*shape, len(data.layout), 2, 2), np.nan + 0j)
-        outcome = np.full(shape, Outcome.REFUSED, object)
-        count, share = np.zeros(shape, int), np.full(shape, np.nan)
+        outcome: Any = np.full(shape, Outcome.REFUSED, object)
+        count = np.zeros(shape, int)
+        share = np.full(shape, np.nan)
         for part in parts:
             f = part.cell[1] // settings.channels
             for own in np.unique(part.pieces[:, cluster]):
-                here = part.pieces[:, cluster] == own
-                k = int(part.column[here, cluster][0])
+                here = np.flatnonzero(part.pieces[:, cluster] == own)
+                k = int(part.column[here[0], cluster])
                 t = int(np.searchsorted(known, own))
                 count[t, f], share[t, f] = part.count, np.sqrt(np.mean(part.share[here] ** 2))
                 outcome[t, f] = part.outcome[k]
-                if outcome[t, f] is Outcome.CONVERGED:
+                if part.outcome[k] is Outcome.CONVERGED:
                     jones[t, f] = part.jones[k]
         longest = max(len(p.history) for p in parts)
         history = np.stack([np.pad(p.history, (0, longest - len(p.history))) for p in parts]).max(axis=0)
@@ -277,7 +282,7 @@ class _Job:
             term=JonesTable(
                 values=jones,
                 slots_s=self.grid.centres_s(cluster),
-                freq_hz=np.array([data.at.freq_hz[f : f + settings.channels].mean() for f in firsts]),
+                freq_hz=freqs[firsts] + (freqs[: settings.channels] - freqs[0]).mean(),
                 stations=tuple(data.layout.names),
             ),
             outcome=outcome,

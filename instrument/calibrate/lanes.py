@@ -226,7 +226,7 @@ def levels(v: Complex, m: Complex, a1: Int, a2: Int, stations: int) -> Float:
 
 
 class Memory:
-    """Anderson's mixing of the last steps of each lane: what is left of a slow or swinging mode is extrapolated away."""
+    """Anderson's mixing of the last steps of each lane: slow and swinging modes are extrapolated away."""
 
     def __init__(self, lanes: int) -> None:
         self.points: list[Float] = []

@@ -121,10 +121,11 @@ class StokesCube:
         header["POLCCONV"] = ("IAU", "U and V: x north, y east, V right-handed")
         header["ORIGIN"] = "instrument"
         hdus = [fits.PrimaryHDU(np.asarray(self.data, np.float32), header=header)]
-        if self.psf is not None:
-            beam = hdus[0].header
-            beam["BMAJ"], beam["BMIN"] = np.rad2deg(self.psf.major_rad[0]), np.rad2deg(self.psf.minor_rad[0])
-            beam["BPA"] = np.rad2deg(self.psf.angle_rad[0])
+        known: Any = [] if self.psf is None else np.flatnonzero(np.isfinite(self.psf.major_rad))
+        if self.psf is not None and len(known):  # FITS has no NaN in a header: the first channel with a beam
+            beam, first = hdus[0].header, known[0]
+            beam["BMAJ"], beam["BMIN"] = np.rad2deg(self.psf.major_rad[first]), np.rad2deg(self.psf.minor_rad[first])
+            beam["BPA"] = np.rad2deg(self.psf.angle_rad[first])
         if uneven or (self.psf is not None and len(self.freq_hz) > 1):
             columns = [fits.Column("FREQ", "D", "Hz", array=self.freq_hz)]
             if self.psf is not None:

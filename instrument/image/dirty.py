@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from instrument.component import Component
 from instrument.errors import InputError, RefusedError
@@ -40,6 +40,16 @@ class Imager(Component):
         if value % 2:
             raise InputError(f"pixels = {value} must be even: take {value + 1}")
         return value
+
+    @model_validator(mode="after")
+    def _on_the_sky(self) -> Self:
+        half = self.pixels / 2 * self.pixel
+        if 2 * half**2 > 1:
+            side = np.rad2deg(2 * half)
+            raise InputError(
+                f"{self.pixels} pixels of {np.rad2deg(self.pixel):.3g} deg are {side:.3g} deg: beyond the sky"
+            )
+        return self
 
     @field_validator("uv_range")
     @classmethod

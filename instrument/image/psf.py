@@ -14,21 +14,24 @@ from instrument.units import Float
 def fit_psf(data: Float, pixel_rad: float) -> Psf:
     """Restoring beam of every channel of a PSF (F, N, N), by least squares on the main lobe above 0.3.
 
-    Warns when the lobe is narrower than 2 pixels or cut by the image; its width is then not to be trusted.
+    Warns where the lobe is narrower than 2.5 pixels, reaches the edge of the image or is no ellipse; its widths are
+    then NaN (edge, no ellipse) or not to be trusted. A channel without data is NaN without a warning.
     """
-    fits = np.array([_fit(plane) if np.isfinite(plane).all() else (np.nan,) * 4 for plane in data])
-    major, minor, angle, residual = fits.T
-    if np.any(minor < 2):
-        warnings.warn(
-            f"the PSF is {np.nanmin(minor):.2g} pixels wide: take smaller pixels or a smaller uv_range",
-            InstrumentWarning,
-            stacklevel=3,
-        )
+    fits = np.array([_fit(plane) if np.isfinite(plane).all() else (np.nan,) * 5 for plane in data])
+    major, minor, angle, residual, edge = fits.T
+    broken = (edge > 0) | (np.isfinite(edge) & ~(np.isfinite(major) & np.isfinite(minor)))
+    for trouble, what in (
+        (minor < 2.5, f"is {np.nanmin(minor, initial=2.5):.2g} pixels wide: take smaller pixels or a smaller uv_range"),
+        (broken, "has no main lobe within the image: no beam is fitted; take a larger image or more baselines"),
+    ):
+        if np.any(trouble):
+            warnings.warn(f"the PSF {what}", InstrumentWarning, stacklevel=3)
+    major, minor, angle = (np.where(broken, np.nan, x) for x in (major, minor, angle))
     return Psf(data, major * pixel_rad, minor * pixel_rad, angle, residual)
 
 
-def _fit(plane: Float) -> tuple[float, float, float, float]:
-    """Full widths in pixels, position angle in rad (north through east), largest residual."""
+def _fit(plane: Float) -> tuple[float, float, float, float, float]:
+    """Full widths in pixels, position angle in rad (north through east), largest residual, 1 where the lobe is cut."""
     from scipy.ndimage import label
     from scipy.optimize import least_squares
 
@@ -36,6 +39,7 @@ def _fit(plane: Float) -> tuple[float, float, float, float]:
     lobes, _ = label(plane > 0.3)
     y, x = np.nonzero(lobes == lobes[ny // 2, nx // 2])
     values = plane[y, x]
+    cut = float(min(x.min(), y.min()) == 0 or x.max() == nx - 1 or y.max() == ny - 1)
     # x runs to the west: east is -x
     east, north = -(x - nx // 2).astype(float), (y - ny // 2).astype(float)
 
@@ -52,4 +56,4 @@ def _fit(plane: Float) -> tuple[float, float, float, float]:
         major, minor = 2 * np.sqrt(np.log(2) / powers)
     angle = np.arctan2(axes[1, 0], axes[0, 0]) % np.pi
     inside = values > 0.5
-    return float(major), float(minor), float(angle), float(np.abs(model(found) - values)[inside].max())
+    return float(major), float(minor), float(angle), float(np.abs(model(found) - values)[inside].max()), cut

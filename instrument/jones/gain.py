@@ -35,7 +35,7 @@ class StationTable(JonesTerm):
     slots_s: Axis | None = None
     freq_hz: Axis | None = None
     rms: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
-    seed: int = 0
+    seed: Annotated[int, Field(ge=0)] = 0
 
     @model_validator(mode="after")
     def _axes_fit(self) -> Self:
@@ -107,6 +107,7 @@ def slot_normals(key: tuple[int, ...], slots_s: Float, shape: tuple[int, ...]) -
     """Complex normal numbers of unit power for each time slot, (T, *shape); a draw depends on key and time only."""
     out = np.empty((len(slots_s), *shape), complex)
     for row, slot in zip(out, slots_s, strict=True):
-        rng = np.random.default_rng([*key, round(slot * 1000)])
+        # times before 1858 have negative seconds, which are counted from the other end
+        rng = np.random.default_rng([*key, round(slot * 1000) % 2**63])
         row[...] = rng.standard_normal((*shape, 2)).view(complex)[..., 0]
     return out * np.sqrt(0.5)

@@ -100,8 +100,7 @@ class Layout(Component):
     @cached_property
     def frames(self) -> tuple[Int, Int]:
         """First station of every distinct set of axes (G,), and the number of its set for each station (A,)."""
-        # directions agree to 1e-9 rad, so the sky cannot tell them apart; the survey's axes carry 1e-10 of rounding
-        _, first, which = np.unique(self.axes.reshape(-1, 9).round(9), axis=0, return_index=True, return_inverse=True)
+        _, first, which = np.unique(self.axes.reshape(-1, 9), axis=0, return_index=True, return_inverse=True)
         order = np.argsort(first)
         rank = np.empty_like(order)
         rank[order] = np.arange(len(order))

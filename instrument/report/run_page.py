@@ -7,7 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from instrument.analyze.leakage import Leakage
+from instrument.analyze.spectra import Spectrum2D
+from instrument.calibrate.base import Solution
+from instrument.calibrate.di_errors import DIComparison
 from instrument.image.cube import StokesCube
+from instrument.report.calibration import convergence, gains, residuals
 from instrument.report.figures import Kind, bubbles, profile
 from instrument.report.images import psf_image, stokes_images
 from instrument.report.page import (
@@ -25,6 +29,7 @@ from instrument.report.page import (
     number,
     write_page,
 )
+from instrument.report.spectra import spectra_2d
 from instrument.report.style import save
 from instrument.units import Direction
 
@@ -32,7 +37,14 @@ PLANES: tuple[tuple[Kind, str], ...] = (("linear", "linear polarization"), ("cir
 
 
 def write_report(
-    record: dict[str, Any], leakage: Leakage | None, cube: StokesCube | None, centre: Direction, folder: Path
+    record: dict[str, Any],
+    leakage: Leakage | None,
+    cube: StokesCube | None,
+    centre: Direction,
+    folder: Path,
+    solution: Solution | None = None,
+    errors: DIComparison | None = None,
+    spectra: dict[str, Spectrum2D] | None = None,
 ) -> None:
     """Draw the figures of a run into its folder and write `report.html`; `record` is what `run.json` holds."""
     entries: list[FigureEntry] = []
@@ -58,8 +70,25 @@ def write_report(
         if cube.psf is not None:
             draw("psf", psf_image(cube), "Point spread function and the Gaussian fitted to its main lobe.")
         draw("images", stokes_images(cube), "Dirty images of the four Stokes parameters.", wide=True)
+    more: list[Section] = []
+    if solution is not None:
+        draw("gains", gains(solution), "Solved gains of every station against time; white where there is no solution.")
+        draw("convergence", convergence(solution), "How the solve converged: the slowest interval.")
+        draw("residual", residuals(solution), "What the solutions leave of the data they were solved from.")
+        blocks: list[Block] = [Text(str(solution))]
+        if errors is not None:
+            blocks.append(
+                Table.of(errors.table(), "The seven direction-independent error parameters, in % of the rms put in.")
+            )
+        more.append(Section("Calibration", blocks))
+    if spectra:
+        draw(
+            "spectrum_2d",
+            spectra_2d(spectra),
+            "2D power spectra of the images, Hann taper; the PSF stays.",
+        )
     sources = None if leakage is None else leakage.table()
-    write_page(page_of_run(record, entries, sources), folder / "report.html")
+    write_page(page_of_run(record, entries, sources, more), folder / "report.html")
 
 
 def page_of_run(

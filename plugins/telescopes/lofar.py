@@ -33,6 +33,11 @@ class _Lofar(Instrument):
     beam_pointing: SkyDirection | None = None
     reference_frequency: Hertz | None = None
 
+    @field_validator("beam_kind", mode="before")
+    @classmethod
+    def _none_in_words(cls, value: Any) -> Any:
+        return None if value == "none" else value  # a scene file has no other word for it
+
     @field_validator("stations", mode="before")
     @classmethod
     def _known(cls, value: Any) -> Any:

@@ -166,7 +166,7 @@ def test_rounding_bound_holds_against_exact_arithmetic_far_from_the_centre(degre
     assert exact_error(made, [(0, 0, 0), (2, 0, 3), (4, 0, 5), (5, 0, 1)]) <= made.error_bound
 
 
-@pytest.mark.parametrize("arcsec", [0.0, 1.0, 60.0, 3600.0])
+@pytest.mark.parametrize("arcsec", [0.0, 60.0, 3600.0])
 def test_rounding_bound_holds_against_exact_arithmetic_near_the_centre(arcsec):
     """l and m carry an absolute rounding of 1e-16, which a bound that falls with l and m forgets."""
     r = np.sin(np.deg2rad(arcsec / 3600))
@@ -264,16 +264,16 @@ def test_centre_that_goes_through_the_zenith_and_sets_is_corrected_while_up_and_
 
 
 def test_leakage_expected_of_a_centre_that_sets_is_the_mean_over_the_time_it_is_up():
-    from instrument.analyze.leakage import expected_percent, mean_mueller
+    from instrument.analyze.leakage import expected_percent
 
     array, centre = equator(), Direction(2.0, 0.0)
     at = plan(array, sky([[0.05, 0.02]], [[1, 0, 0, 0]], centre), observation(centre, 16, 60)).problem.at
     up = at.centre_itrf @ array.layout().axes[0, 2] > 0
     first, last = np.flatnonzero(up)[[0, -1]]
-    while_up = mean_mueller(array.chain(), at.block(slice(first, last + 1), slice(None)), differential=True)
+    one = np.array([[1.0, 0, 0, 0]])
+    while_up = expected_percent(array.chain(), at.block(slice(first, last + 1), slice(None)), one)
     assert np.isfinite(while_up).all()
-    whole = expected_percent(array.chain(), at, np.array([[1.0, 0, 0, 0]]))
-    assert np.isfinite(whole).all()
+    assert expected_percent(array.chain(), at, one) == pytest.approx(while_up, rel=1e-9)
 
 
 def test_a_centre_that_sets_leaves_no_nan_in_what_a_run_writes(tmp_path, monkeypatch):
@@ -320,7 +320,7 @@ def test_right_ascensions_on_both_sides_of_zero_are_neighbours(ra0_deg):
     assert np.abs(l - np.cos(dec) * np.sin(step)).max() < 5e-16
     assert np.abs(m - (np.sin(dec) * np.cos(0.84) - np.cos(dec) * np.sin(0.84) * np.cos(step))).max() < 5e-16
     of = PointSky(names=tuple("abcd"), ra_rad=ra, dec_rad=dec, stokes_jy=np.eye(4)[[0, 0, 0, 0]])
-    _, seen = both(lofar(), of, observation(centre))
+    both(lofar(), of, observation(centre))
     # 0 and 360 deg are one direction
     one, other = (both(lofar(), of.select([k]), observation(centre))[1].data for k in (2, 3))
     assert np.abs(one - other).max() < 1e-10
@@ -500,7 +500,7 @@ def test_channels_in_any_order_are_the_same_channels():
 
 def test_fluxes_of_1e_300_and_1e12_jy_side_by_side_keep_their_place():
     of = sky([[0, 0], [0.03, 0.01], [-0.02, 0.04]], [[1e12, 0, 0, 0], [1e-300, 0, 0, 0], [1, 0.5, 0, 0]])
-    made, seen = both(lofar(), of)
+    made, _ = both(lofar(), of)
     assert made.problem.at.shape[3] == 3
     bare = both(lofar(beam=None), of)[1]
     assert np.abs(bare.data[..., 0, 0]).max() == pytest.approx(1e12, rel=1e-9)
@@ -552,8 +552,8 @@ def test_a_sky_of_q_and_u_only_goes_the_whole_way():
     assert np.abs(bare.stokes()[..., [0, 3]]).max() < 1e-15
     image = Imager(pixels=64, pixel=20 * u.arcsec).image(bare)
     assert np.abs(image.data[0, [0, 3]]).max() < 1e-12
-    # 2.9 arcmin off, so that the sum over the uv plane at the centre is 1 and a little of the other's sidelobes
-    assert image.data[0, 1, 32, 32] == pytest.approx(1, abs=0.3)
+    for k in (1, 2):  # at the centre an image is the mean of the visibilities
+        assert image.data[0, k, 32, 32] == pytest.approx(bare.stokes()[..., k].real.mean(), abs=1e-6)
     fluxes = ForcedPhotometry().measure(bare, of)
     assert np.abs(fluxes.stokes_jy[0] - of.stokes_jy).max() < 1e-10
     leaked = Analyzer(visibilities=seen.without_beam(array), sky=of).leakage()
@@ -631,7 +631,7 @@ def test_one_bad_number_in_one_correlation_takes_its_visibility_out_and_nothing_
     flag[2, 0, 3] = True
     imager = Imager(pixels=32, pixel=1 * u.arcmin)
     spoilt, cut = seen.with_data(data), seen.flagged(flag)
-    assert np.array_equal(imager.image(spoilt).data, imager.image(cut).data)
+    assert np.abs(imager.image(spoilt).data - imager.image(cut).data).max() < 1e-12  # threads add in any order
     a, b = (ForcedPhotometry().measure(v, of).stokes_jy for v in (spoilt, cut))
     assert np.array_equal(a, b)
     assert np.abs(a[0, :, 0] - [1, 2]).max() < 1e-9
@@ -815,7 +815,7 @@ def test_the_low_band_is_the_definition_from_15_to_90_mhz():
     array = lofar("lba", ["CS001LBA", "CS302LBA", "RS106LBA", "RS406LBA", "RS508LBA"])
     rng = np.random.default_rng(4)
     of = sky(rng.uniform(-0.5, 0.5, (30, 2)), rng.normal(size=(30, 4)))
-    _, seen = both(array, of, observation(mhz=(15, 60, 90)))
+    both(array, of, observation(mhz=(15, 60, 90)))
     stokes = [1.0, 0.1, 0.2, -0.3]
     centre = both(array, sky([[0, 0]], [stokes]), observation(mhz=(15, 60, 90)))[1].without_beam(array)
     assert np.abs(centre.data - mueller.brightness(np.array(stokes))).max() < 1e-11
@@ -837,14 +837,21 @@ def test_an_image_to_the_edge_of_the_sky_is_the_plain_sum_in_its_corners():
     """64 pixels of 0.02 rad: corners at l2 + m2 = 0.82, baselines beyond the Nyquist limit of the pixels."""
     of = sky([[0.3, -0.2]], [[1, 0, 0, 0]])
     seen = plan(lofar(stations=STATIONS[:3], beam=None), of, observation(minutes=120)).run()
-    image, said = quietly(lambda: Imager(pixels=64, pixel=0.02 * u.rad, accuracy=1e-9).image(seen))
+    image, _ = quietly(lambda: Imager(pixels=64, pixel=0.02 * u.rad, accuracy=1e-9).image(seen))
     for x, y in ((0, 0), (63, 1), (32, 32), (5, 60)):
         l, m = -0.02 * (x - 32), 0.02 * (y - 32)
         n1 = np.sqrt(1 - l**2 - m**2) - 1
         turns = seen.uvw_m @ [l, m, n1] * 150e6 / LIGHT
         want = (seen.stokes()[:, 0, :, 0] * np.exp(2j * np.pi * turns)).real.mean()
         assert image.data[0, 0, y, x] == pytest.approx(want, abs=1e-7)
-    assert said  # pixels wider than the beam
+
+
+@pytest.mark.parametrize("arcmin", [0.4, 3.0, 60.0])
+def test_pixels_wider_than_the_beam_are_said_to_be(arcmin):
+    """A beam of 0.2 arcmin in one pixel: the fit stays where it began, 2 pixels wide, and K per Jy is wrong by 1e2."""
+    seen = plan(lofar(beam=None), sky([[0, 0]], [[1, 0, 0, 0]]), observation(minutes=30)).run()
+    _, said = quietly(lambda: Imager(pixels=64, pixel=arcmin * u.arcmin).image(seen))
+    assert said
 
 
 # The command line ------------------------------------------------------------------------------------------------
@@ -873,9 +880,19 @@ def test_a_negative_seed_is_one_clear_line(tiny, capsys, setting):
     assert [p.name for p in tiny.iterdir()] == ["tiny.toml"]
 
 
-@pytest.mark.parametrize("out", ["tiny.toml/x", "/proc/x/y"])
-def test_a_folder_that_cannot_be_made_is_one_clear_line(tiny, capsys, out):
-    assert out.split("/")[1] in one_line(capsys, "run", "tiny.toml", "--out", out)
+def test_a_folder_below_a_file_is_one_clear_line(tiny, capsys):
+    assert "tiny.toml" in one_line(capsys, "run", "tiny.toml", "--out", "tiny.toml/x")
+
+
+def test_a_folder_that_may_not_be_written_is_one_clear_line(tiny, capsys, monkeypatch):
+    """Before anything is computed; as root no folder is read-only, so the refusal of the system is played."""
+    from pathlib import Path
+
+    def refuse(self, *args, **settings):
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    assert "out" in one_line(capsys, "run", "tiny.toml", "--out", "out")
 
 
 def test_the_current_folder_when_empty_is_a_folder_to_write(tiny, capsys, monkeypatch):
@@ -904,6 +921,21 @@ def test_what_a_run_records_is_json_when_nothing_could_be_measured(tiny):
     (tiny / "qu.csv").write_text("ra_deg,dec_deg,i_jy,q_jy,u_jy\n123.4,48.2175,0,1,0\n124.0,48.5,0,0.5,0.5\n")
     assert main(["run", "tiny.toml", "--out", "qu", "--set", "sky={kind='catalogue',path='qu.csv'}"]) == 0
     json.loads((tiny / "qu" / "run.json").read_text(), parse_constant=refuse)
+
+
+def test_leakage_measured_and_expected_are_of_one_channel(tiny):
+    """Channels given from high to low: fluxes are sorted by frequency, the expectation was made for the first one."""
+    from astropy.table import QTable
+
+    found = []
+    for name, order in (("up", "'120 MHz','180 MHz'"), ("down", "'180 MHz','120 MHz'")):
+        where = "phase_centre='08h13m36.0s +48d13m03s',transit='2012-12-07',duration='3 h',interval='1 h'"
+        setting = f"observation={{{where},frequencies=[{order}]}}"
+        assert main(["run", "tiny.toml", "--out", name, "--no-verify", "--set", setting]) == 0
+        found.append(QTable.read(tiny / name / "leakage.ecsv"))
+    assert found[0].meta["frequency_hz"] == found[1].meta["frequency_hz"]
+    for column in ("linear", "linear_expected"):
+        assert found[0][column].value == pytest.approx(found[1][column].value, rel=1e-6)
 
 
 def test_nested_parents_are_made_and_a_second_run_takes_the_next_name(tiny):

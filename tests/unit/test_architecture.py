@@ -41,7 +41,9 @@ LAYERS = (
     ("report",),
     ("scene_file",),
     ("conformance", "conformance_bench", "conformance_terms", "conformance_engines"),
+    ("calibration_run",),
     ("doctor",),
+    ("run_record",),
     ("run",),
     ("",),  # `instrument` itself, which looks names up in all of them when they are first used
     ("cli",),
