@@ -176,6 +176,7 @@ stations, elements and clusters of (mean error / its standard error)^2, and in p
 
 In 300 s the turning is part of the scatter of the errors and cancels in their mean over the whole turn of an hour: the
 last figure of bias falls below what independent errors give.
+
 59 stations, an interval of 60 s: {large:.1f} s on one core.
 
 ## Outliers, 60 s, 20 min

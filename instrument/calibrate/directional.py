@@ -218,19 +218,17 @@ class _Job:
 
     def solve(self, block: int, channel: int) -> _Part:
         """Solve one block of integrations, and `channels` channels from `channel` on."""
-        settings, grid = self.settings, self.grid
+        s, grid = self.settings, self.grid
         rows = np.flatnonzero(grid.number // grid.whole == block)
         pieces, place = np.unique(grid.number[rows] // grid.piece, return_inverse=True)
         chosen = [rows[place == k] for k in range(len(pieces))]
-        span = slice(channel, min(channel + settings.channels, self.data.data.shape[1]))
+        span = slice(channel, min(channel + s.channels, self.data.data.shape[1]))
         first = np.stack([pieces * grid.piece // step for step in grid.steps], axis=1)
         column, offset = np.zeros_like(first), 0
         for c in range(first.shape[1]):
             column[:, c] = np.unique(first[:, c], return_inverse=True)[1] + offset
             offset = int(column[:, c].max(initial=-1)) + 1
-        limits = Limits(
-            settings.pattern, settings.tolerance, settings.iterations, settings.robust, settings.unexplained
-        )
+        limits = Limits(s.pattern, s.tolerance, s.iterations, s.robust, s.unexplained)
         # [piece][time, channel] as samples of pieces of one length, filled up with weight zero
         weight = _even([self.weight[t, span] for t in chosen])
         models = np.stack([_even([m[t, span] for t in chosen]) for m in self.models])
