@@ -45,7 +45,8 @@ def run(
     folder = _folder(scene_file.name, out)
     begin = time.perf_counter()
     scene = scene_file.scene()
-    solved = scene_file.calibrate is not None
+    solved = scene_file.calibrator() is not None
+    scene_file.laboratory()  # wrong settings are refused before anything is computed
     # a run that calibrates predicts the perfect instrument: its errors are put in block by block, and are the truth
     perfect = scene.with_fields(instrument=scene.instrument.with_fields(gain=None, feed=None)) if solved else scene
     plan = scene_file.plan(perfect, memory, workers)
@@ -102,6 +103,11 @@ def _remove_empty(folders: list[Path]) -> None:
 def _compute(result: Result) -> None:
     """Stream the blocks through the stages that the scene has."""
     scene, plan = result.scene, result.plan
+    laboratory = scene.laboratory()
+    if laboratory is not None:
+        with result.timed("sweep"), progress_bar(f"{scene.name}: predict, solve and measure every model") as update:
+            result.sweep = laboratory.run(plan, progress=update)
+        return
     centre = plan.problem.at.centre
     wants = scene.analyze.products if scene.analyze else ()
     images = photometry = density = None
@@ -165,8 +171,9 @@ def _compute(result: Result) -> None:
 
 
 def _expected(fluxes: SourceFluxes, plan: Plan, differential: bool) -> Float:
-    """Leakage (G, 2) in % expected from the beam model at the first channel, from evenly spread integrations."""
-    at = plan.problem.at.block(slice(None), slice(0, 1)).towards(fluxes.ra_rad, fluxes.dec_rad)
+    """Leakage (G, 2) in % the beam model has in the first channel of the fluxes, from evenly spread integrations."""
+    channel = int(abs(plan.problem.at.freq_hz - fluxes.freq_hz[0]).argmin())
+    at = plan.problem.at.block(slice(None), slice(channel, channel + 1)).towards(fluxes.ra_rad, fluxes.dec_rad)
     times, _, stations, sources = at.shape
     step = max(1, round(times * stations * sources / EXPECTED_JONES))
     chosen: Sampling = at.block(slice(step // 2, None, step), slice(None))
@@ -184,6 +191,8 @@ def _write(result: Result, tables: dict[str, Any], folder: Path) -> None:
         result.leakage.write(folder / "leakage.ecsv")
     if result.calibration is not None:
         result.calibration.write(folder)
+    if result.sweep is not None:
+        result.sweep.write(folder)
     for stokes, spectrum in result.spectra.items():
         spectrum.write(folder / f"spectrum_2d_{stokes}.ecsv")
     what = record(result, tables)
@@ -200,5 +209,6 @@ def _write(result: Result, tables: dict[str, Any], folder: Path) -> None:
         solution=solved.solution if solved else None,
         errors=solved.errors if solved else None,
         spectra=curves,
+        sweep=result.sweep,
     )
     (folder / "run.json").write_text(json.dumps(json_ready(what), indent=2, allow_nan=False), encoding="utf-8")

@@ -16,6 +16,7 @@ import numpy as np
 from instrument.analyze.leakage import CLEAR, Leakage
 from instrument.analyze.photometry import SourceFluxes
 from instrument.analyze.spectra import Spectrum2D
+from instrument.analyze.sweep import Sweep
 from instrument.calibration_run import CalibrationResult
 from instrument.doctor import package_version
 from instrument.errors import Outcome
@@ -40,6 +41,7 @@ class Result:
     leakage: Leakage | None = None
     calibration: CalibrationResult | None = None
     spectra: dict[str, Spectrum2D] = field(default_factory=dict)
+    sweep: Sweep | None = None
     check: Check | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -168,6 +170,19 @@ def summary(result: Result) -> str:
             lines.append(f"left out: {faint} sources too faint beside the others (error above {CLEAR:g} % of I)")
     if result.calibration is not None:
         lines += ["", *result.calibration.summary()]
+    if result.sweep is not None:
+        lines.append("")
+        lines.append(
+            "sources  of the flux  visibilities   image     bright sources: flux, position   others: flux, position"
+        )
+        for row in result.sweep.table():
+            image = f"{row['image_rms'].value:5.2f} %" if "image_rms" in row.colnames else ""
+            lines.append(
+                f"{row['n']:7d}  {row['flux_share'].value:9.1f} %  {row['visibility_rms'].value:10.2f} %  {image}"
+                f"  {row['bright_flux_median'].value:15.3f} %, {row['bright_shift_median'].value:.3f} arcsec"
+                f"  {row['unmodelled_flux_median'].value:8.2f} %, {row['unmodelled_shift_median'].value:.3f} arcsec"
+            )
+        lines.append("rms of what is left over the rms of the data or image; medians of errors of fluxes and positions")
     if result.fluxes is not None:
         bad = [o.value for o in result.fluxes.outcome if o is not Outcome.CONVERGED]
         lines += [f"photometry fell short: {text}" for text in bad]

@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
+from instrument.analyze.laboratory import IncompleteModel
 from instrument.analyze.photometry import ForcedPhotometry
 from instrument.calibrate.selfcal import SelfCal
 from instrument.component import Component
@@ -29,6 +30,7 @@ from instrument.scene import Scene
 from instrument.sky.base import Sky
 from instrument.units import Float, Hertz, HertzArray, Instant, Jansky, Seconds, SkyDirection
 
+CALIBRATIONS = ("selfcal", "incomplete-model")
 STAGES = ("noise", "calibrate", "correct", "image", "analyze")
 SEED_STEP = 1000  # seeds of the stages of a scene are derived from its one seed
 
@@ -119,6 +121,7 @@ class SceneFile(Component):
 
     @model_validator(mode="after")
     def _stages_fit(self) -> Self:
+        self._calibration()
         if not self.name or any(c in self.name for c in "/\\\0") or self.name.startswith("."):
             raise InputError(f"name = {self.name!r} cannot name a folder")
         if self.analyze and "spectrum-2d" in self.analyze.products and self.image is None:
@@ -153,14 +156,28 @@ class SceneFile(Component):
 
     def calibrator(self) -> SelfCal | None:
         """The solver of the table [calibrate], where there is one."""
-        if self.calibrate is None:
+        kind, settings = self._calibration()
+        with _in_table("calibrate"):
+            return SelfCal(**settings) if kind == "selfcal" else None
+
+    def laboratory(self) -> IncompleteModel | None:
+        """The sweep over models of the table [calibrate], where its kind is "incomplete-model"."""
+        kind, settings = self._calibration()
+        if kind != "incomplete-model":
             return None
+        noise = {} if self.noise is None else {"sefd": f"{self.noise.sefd!r} Jy"}
+        with _in_table("calibrate"):
+            return IncompleteModel(**{"image": self.image, "seed": SEED_STEP * self.seed + 3, **noise, **settings})
+
+    def _calibration(self) -> tuple[str | None, dict[str, Any]]:
+        """Kind and settings of the table [calibrate]."""
+        if self.calibrate is None:
+            return None, {}
         settings = dict(self.calibrate)
         kind = settings.pop("kind", None)
-        if kind != "selfcal":
-            raise InputError(f"[calibrate] kind = {kind!r} is not one of: selfcal")
-        with _in_table("calibrate"):
-            return SelfCal(**settings)
+        if kind not in CALIBRATIONS:
+            raise InputError(f"[calibrate] kind = {kind!r}: {did_you_mean(str(kind), CALIBRATIONS)}")
+        return kind, settings
 
     def scene(self) -> Scene:
         """The scene: instrument, sky and observation."""

@@ -18,7 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from instrument.analyze.laboratory import IncompleteModel, ranks
+from instrument.analyze.laboratory import IncompleteModel
+from instrument.analyze.sweep import ranks
 from instrument.report.laboratory import errors_against_model
 from instrument.report.spectra import spectra_2d
 from instrument.report.style import save
@@ -130,8 +131,8 @@ brightest and others down to the faintest, all baselines, against their apparent
   {100 * lost:.2f} % (2/59 of their image); the rest is what the wrong gains make of 3C196.
 * **The residual falls with every step of the model**: visibilities, image and spectrum, in {falling} of
   {power.shape[1]} bins of k.
-* **Errors of the bright sources fall with n**: rms and median of the flux errors at every step. Their median position
-  error need not fall with the first few sources: it is that of sources low in the beam.
+* **Errors of the bright sources fall with n**: rms and median of their flux errors at every step, the median of their
+  position errors from 5 sources on.
 * **Sources outside the model lose about 2/A of their flux**, 3.4 % for A = 59 stations, however many are in the
   model: amplitudes and phases of A stations follow that share of what the model does not explain. Measured:
   {", ".join(f"{100 * (1 - s):.1f}" for s in found.suppression)} %.

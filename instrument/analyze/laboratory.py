@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from instrument.analyze.offsets import OffsetSums
-from instrument.analyze.sweep import Sweep, find_ghosts
+from instrument.analyze.sweep import Sweep, find_ghosts, ranks
 from instrument.calibrate.base import Solution
 from instrument.calibrate.selfcal import SelfCal
 from instrument.component import Component
@@ -65,7 +65,7 @@ class IncompleteModel(Component):
         return value
 
     def run(self, plan: Plan, progress: Callable[[float], None] | None = None) -> Sweep:
-        """Sweep over the models on the scene of a plan (all baselines: without `uv_range`), block by block in time.
+        """Sweep over the models on the scene of a plan (made without `uv_range`: solves need all baselines), in blocks.
 
         `progress` is called with the fraction done. Raises `InputError` where the sky is no list of sources, or has
         fewer than a model asks for.
@@ -95,17 +95,6 @@ class IncompleteModel(Component):
         # where several fall on one rank they move on to the next free ones
         tail = np.minimum(np.maximum.accumulate(tail - steps) + steps, count - len(steps) + steps)
         return np.concatenate([np.arange(head), tail])
-
-
-def ranks(sky: PointSky) -> Int:
-    """Rank of each source by |I| + P, from 0 for the brightest (S,); the sources of a patch share theirs."""
-    patches = sky.patches or ("",) * len(sky)
-    labels = [f"patch {p}" if p else f"source {i}" for i, p in enumerate(patches)]
-    _, group = np.unique(labels, return_inverse=True)
-    power = np.bincount(group, sky.power_jy)
-    order = np.empty(len(power), int)
-    order[np.argsort(-power, kind="stable")] = np.arange(len(power))
-    return np.asarray(order[group])
 
 
 @dataclass

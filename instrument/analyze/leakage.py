@@ -28,7 +28,8 @@ class Leakage:
     The polarization that the sky has there, as a fraction of I, is taken out first. `error_jy` (4,) is what the rest of
     the visibilities leaves on a flux (see `SourceFluxes`). `near_null` marks sources whose apparent flux is below 1 %
     of the true one: their leakage is a ratio of two small numbers and says little about the instrument. `measured`
-    leaves those out, and those too faint beside their neighbours to be known to 0.1 % or a third of the leakage.
+    leaves those out, those that have no Stokes I in the sky, and those too faint beside their neighbours to be known to
+    0.1 % or a third of the leakage. Sources that the tolerance of a plan drops are not in what a run measures.
     `expected` holds the same leakages (G, 2) from the beam model (the mean Mueller matrix over baselines and times),
     where it was asked for.
     """
@@ -76,7 +77,8 @@ class Leakage:
         """Which sources have a leakage that says something (G,)."""
         with np.errstate(invalid="ignore"):
             error = self.error_percent[:, 0]
-            return ~self.near_null & ((error <= CLEAR) | (SURE * error <= self.linear_percent))
+            known = (error <= CLEAR) | (SURE * error <= self.linear_percent)
+        return known & ~self.near_null & (self.model_jy[:, 0] != 0)
 
     def table(self) -> Any:
         """Everything as an astropy table, one row a source, with units."""
@@ -150,7 +152,7 @@ def leakage_of(fluxes: SourceFluxes, centre: Direction, channel: int = 0, expect
     """Leakage of measured fluxes in one channel, about a centre."""
     measured, model = fluxes.stokes_jy[channel], fluxes.model_jy[channel]
     with np.errstate(invalid="ignore"):
-        null = ~(np.abs(measured[:, 0]) >= NULL * np.abs(model[:, 0]))
+        null = np.abs(measured[:, 0]) < NULL * np.abs(model[:, 0])
     return Leakage(
         names=fluxes.names,
         ra_rad=fluxes.ra_rad,
@@ -160,7 +162,7 @@ def leakage_of(fluxes: SourceFluxes, centre: Direction, channel: int = 0, expect
         stokes_jy=measured,
         error_jy=fluxes.error_jy[channel],
         freq_hz=float(fluxes.freq_hz[channel]),
-        near_null=null | (model[:, 0] == 0),
+        near_null=null,
         expected=expected,
     )
 
@@ -169,18 +171,26 @@ def mean_mueller(chain: Chain, at: Sampling, differential: bool) -> Complex:
     """Mueller matrix of each direction, the mean over all baselines a < b and the times of `at`, complex (F, S, 4, 4).
 
     Both orders of a baseline are counted, so what is antisymmetric between stations cancels, as it does in an image.
+    Stations whose beam at the centre cannot be inverted at a time are left out of it, as they are flagged in data; NaN
+    where no baseline is left.
     """
     times, channels, stations, sources = at.shape
     centre = chain.jones(at.at_centre()) if differential else None
-    total = np.zeros((channels, sources, 4, 4), complex)
+    total, count = np.zeros((channels, sources, 4, 4), complex), np.zeros(channels)
     for t in range(times):
         one = at.block(slice(t, t + 1), slice(None))
         jones = np.broadcast_to(chain.jones(one), (1, channels, stations, sources, 2, 2))[0]
+        good: Bool = np.ones((channels, stations), bool)
         if centre is not None:
-            jones = mat2.mul(mat2.inverse(np.broadcast_to(centre, (times, channels, stations, 1, 2, 2))[t]), jones)
+            inverse = mat2.inverse(np.broadcast_to(centre, (times, channels, stations, 1, 2, 2))[t])
+            good = np.asarray(np.isfinite(inverse).all(axis=(-3, -2, -1)))
+            jones = mat2.mul(np.where(good[..., None, None, None], inverse, 0.0), jones)
         whole = jones.sum(axis=1)
         total += _kron(whole, whole) - _kron(jones, jones).sum(axis=1)
-    return np.asarray(TO_STOKES @ (total / (times * stations * (stations - 1))) @ TO_LINEAR)
+        left = good.sum(axis=1)
+        count += left * (left - 1)
+    mean = total / np.where(count > 0, count, np.nan)[:, None, None, None]
+    return np.asarray(TO_STOKES @ mean @ TO_LINEAR)
 
 
 def _kron(a: Complex, b: Complex) -> Complex:

@@ -59,6 +59,11 @@ class Sweep:
     ghosts: tuple[Ghost, ...]
 
     @property
+    def passed(self) -> bool:
+        """Whether every solve converged."""
+        return not np.any(self.failed > 0)
+
+    @property
     def seen(self) -> Bool:
         """Which watched sources are not near a null of the beam (G,)."""
         return self.flux_jy > NULL * self.model_jy
@@ -192,3 +197,14 @@ def find_ghosts(cube: StokesCube, sky: PointSky) -> Ghost:
     spot = np.unravel_index(np.argmax(away), image.shape)
     ra, dec = offset(cube.centre, *np.moveaxis(where[spot][None], -1, 0))
     return Ghost(float(away[spot]), float(ra[0]), float(dec[0]))
+
+
+def ranks(sky: PointSky) -> Int:
+    """Rank of each source by |I| + P, from 0 for the brightest (S,); the sources of a patch share theirs."""
+    patches = sky.patches or ("",) * len(sky)
+    labels = [f"patch {p}" if p else f"source {i}" for i, p in enumerate(patches)]
+    _, group = np.unique(labels, return_inverse=True)
+    power = np.bincount(group, sky.power_jy)
+    order = np.empty(len(power), int)
+    order[np.argsort(-power, kind="stable")] = np.arange(len(power))
+    return np.asarray(order[group])

@@ -21,7 +21,8 @@ WAYS = (1.0, 0.3, 0.1, 0.03)  # of a step: a snapshot of five clusters (conditio
 GRADIENTS = 300  # most conjugate gradients of one round
 MEDIAN_CHI2_8 = 7.344  # of |r|^2 / sigma^2 of a visibility: four complex correlations
 RIDGE = 1e-13  # of the diagonal: the answer moves by less, and nothing is divided by zero
-COINCIDENT = 1e-10  # smallest eigenvalue, relative to the diagonal, of equations that still tell columns apart
+COINCIDENT = 1e-10  # smallest eigenvalue, relative to the diagonal, of equations of a station that have an answer
+ALIKE = 1e-4  # of the models over the whole array: with less, noise mixes the matrices of two clusters
 
 
 @dataclass(frozen=True)
@@ -169,10 +170,11 @@ class Block:
             return np.sqrt(one / whole)
 
     def _singular(self, x: Complex) -> bool:
-        """Whether clusters are alike, as models (then their matrices mix freely) or once corrupted."""
+        """Whether clusters are alike: as models to the array (then their matrices mix), or corrupted to a station."""
         plain: Complex = np.eye(2)[None, :, None, :] * self.active.T[:, None, :, None] + 0j
-        each = (_scaled(_Equations(self, y, self._seen(y)[0], self.w).normal)[0] for y in (plain, x))
-        return any(bool(np.linalg.eigvalsh(n).min() < COINCIDENT) for n in each)
+        whole, each = (_Equations(self, y, self._seen(y)[0], self.w).normal for y in (plain, x))
+        alike = np.linalg.eigvalsh(_scaled(whole.sum(axis=0))[0]).min() < ALIKE
+        return bool(alike or np.linalg.eigvalsh(_scaled(each)[0]).min() < COINCIDENT)
 
     def _counts(self, power: Float) -> Float:
         """Weighted power of the models for each unknown, (K, A)."""

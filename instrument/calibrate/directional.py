@@ -250,8 +250,7 @@ class _Job:
         if self.settings.start is not None and len(row):
             at = self.data.at.block(slice(row[0], row[0] + 1), slice(span.start, span.start + 1))
             given = np.broadcast_to(self.settings.start.jones(at)[0, 0, :, 0], begin.shape)
-            good: Any = np.isfinite(given).all(axis=(-2, -1))
-            begin = np.where(good[..., None, None], given, begin)
+            begin = np.where(np.isfinite(given).all(axis=(-2, -1), keepdims=True), given, begin)
         return begin
 
     def gathered(self, cluster: int, parts: list[_Part]) -> Solution:

@@ -8,12 +8,14 @@ from typing import Any
 
 from instrument.analyze.leakage import Leakage
 from instrument.analyze.spectra import Spectrum2D
+from instrument.analyze.sweep import Sweep
 from instrument.calibrate.base import Solution
 from instrument.calibrate.di_errors import DIComparison
 from instrument.image.cube import StokesCube
 from instrument.report.calibration import convergence, gains, residuals
 from instrument.report.figures import Kind, bubbles, profile
 from instrument.report.images import psf_image, stokes_images
+from instrument.report.laboratory import errors_against_model
 from instrument.report.page import (
     Block,
     Card,
@@ -45,6 +47,7 @@ def write_report(
     solution: Solution | None = None,
     errors: DIComparison | None = None,
     spectra: dict[str, Spectrum2D] | None = None,
+    sweep: Sweep | None = None,
 ) -> None:
     """Draw the figures of a run into its folder and write `report.html`; `record` is what `run.json` holds."""
     entries: list[FigureEntry] = []
@@ -81,6 +84,14 @@ def write_report(
                 Table.of(errors.table(), "The seven direction-independent error parameters, in % of the rms put in.")
             )
         more.append(Section("Calibration", blocks))
+    if sweep is not None:
+        what = "Errors against the number of sources in the model."
+        draw("errors_against_model", errors_against_model(sweep), what)
+        rows = Table.of(sweep.table(), "One row a model of the n brightest sources.")
+        more.append(Section("Incomplete models", [rows]))
+        if sweep.reference is not None:
+            curves = sweep.spectra(taper="hann").items()
+            spectra = {f"left with {n} in the model" if n else "true image": curve for n, curve in curves}
     if spectra:
         draw(
             "spectrum_2d",

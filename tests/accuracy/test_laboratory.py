@@ -8,9 +8,9 @@ from astropy.table import QTable
 
 import instrument
 from instrument import Imager, InputError, Observation, PointSky, Scene, SelfCal
-from instrument.analyze.laboratory import IncompleteModel, ranks
+from instrument.analyze.laboratory import IncompleteModel
 from instrument.analyze.offsets import OffsetSums
-from instrument.analyze.sweep import ARCSEC
+from instrument.analyze.sweep import ARCSEC, ranks
 from instrument.report.laboratory import errors_against_model
 from instrument.report.style import save
 
@@ -29,11 +29,11 @@ def field(count=30, seed=4, patches=False, **more):
     return PointSky.at(where, flux, **more)
 
 
-def plan(sky, duration=8 * u.hour, interval=30 * u.min, **settings):
+def plan(sky, duration=8 * u.hour, interval=30 * u.min, frequencies=(150,), **settings):
     array = instrument.load("telescopes", "lofar-hba", stations=STATIONS, **settings)
     observation = Observation(
         phase_centre=CENTRE, transit="2012-12-07", duration=duration, interval=interval,
-        frequencies=[150] * u.MHz, channel_width=0.2 * u.MHz,
+        frequencies=frequencies * u.MHz, channel_width=0.2 * u.MHz,
     )  # fmt: skip
     return Scene(instrument=array, sky=sky, observation=observation).plan()
 
@@ -123,6 +123,17 @@ def test_a_sweep_in_pieces_is_the_sweep_at_once(sweep, monkeypatch):
     assert pieces.change_jy == pytest.approx(sweep.change_jy[[0, 2]], abs=1e-3)
 
 
+def test_solutions_over_several_integrations_and_channels_and_every_second_integration_for_fluxes(monkeypatch):
+    monkeypatch.setattr("instrument.analyze.laboratory.BLOCK_BYTES", 64 * 91 * 2 * 6.5)  # 6 integrations at a time
+    where = plan(field(12), duration=8.5 * u.hour, frequencies=(149, 151), beam=None, gain=instrument.GainTerm(rms=0))
+    found = IncompleteModel(models=(1, 12), selfcal=SelfCal(interval=1 * u.hour, channels=2), every=2).run(where)
+    assert list(found.failed) == [0, 0] and 0.01 < found.visibility_share[0] < 0.1 and found.visibility_share[1] < 1e-9
+    assert found.flux_jy == pytest.approx(field(12).stokes_jy[:, 0], rel=1e-9)
+    # a solution of four times the data absorbs less of what it does not know
+    single = IncompleteModel(models=(1,)).run(where)
+    assert found.suppression[0] > single.suppression[0]
+
+
 def test_noise_is_the_same_in_truth_and_result():
     quiet = IncompleteModel(models=(30,), sefd=1 * u.Jy, seed=1).run(plan(field(), beam=None))
     # a tenth of a percent of noise: only what the gains make of it is left
@@ -132,7 +143,7 @@ def test_noise_is_the_same_in_truth_and_result():
 def test_a_model_on_which_every_solve_fails_is_named_and_has_no_figures():
     strict = SelfCal(unexplained=1e-3)
     found = IncompleteModel(models=(1, 30), selfcal=strict, image=IMAGER).run(plan(field(), beam=None))
-    assert list(found.failed) == [1, 0]
+    assert list(found.failed) == [1, 0] and not found.passed
     assert np.isnan(found.visibility_share[0]) and np.isnan(found.image_share[0])
     assert np.isnan(found.change_jy[0]).all() and np.isfinite(found.change_jy[1]).all()
 

@@ -1,5 +1,7 @@
 """Forced photometry: fluxes that were put in come out, by either way of solving; what cannot be measured says so."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from astropy import units as u
@@ -158,3 +160,104 @@ def test_error_of_fluxes_is_the_noise_when_there_is_noise():
     count = vis.data.shape[0] * vis.data.shape[2]
     assert np.mean(errors, axis=0) == pytest.approx([sigma / np.sqrt(2 * count)] * 4, rel=0.02)
     assert np.std(gaps) == pytest.approx(sigma / np.sqrt(2 * count), rel=0.15)
+
+
+def test_weights_of_integrations_enter_either_way_of_solving():
+    """Fluxes that change with time, so that the answer depends on the weights; NaN where there is no weight."""
+    sky = polarized(shapes=True)
+    vis = bare(sky)
+    times = len(vis.data)
+    weight = np.random.default_rng(2).uniform(0.1, 5, (times, 1, 1))
+    weight[3] = 0
+    data = vis.data * np.linspace(1, 2, times)[:, None, None, None, None]
+    data[3] = np.nan
+    vis = vis.with_data(data)
+    direct = ForcedPhotometry().measure(vis.weighted(weight), sky)
+    uneven = weight * np.ones(len(vis.antenna1))
+    uneven[..., 0] *= 1 + 1e-9
+    iterated = ForcedPhotometry(accuracy=1e-12).measure(vis.weighted(uneven), sky)
+    assert (direct.iterations, iterated.iterations > 0) == (0, True)
+    assert np.abs(direct.stokes_jy - iterated.stokes_jy).max() < 1e-5
+    assert np.abs(direct.stokes_jy - ForcedPhotometry().measure(vis, sky).stokes_jy)[0, 0, 0] > 1
+    # only ratios of weights matter
+    scaled = ForcedPhotometry().measure(vis.weighted(1e-12 * weight), sky)
+    assert np.abs(direct.stokes_jy - scaled.stokes_jy).max() < 1e-8
+    assert scaled.error_jy == pytest.approx(direct.error_jy, rel=1e-6)
+
+
+ITERATED = ForcedPhotometry(uv_range=(0, 1e7))
+
+
+def test_conjugate_gradients_say_when_groups_cannot_be_told_apart():
+    sky = polarized(count=4).with_fields(stokes_jy=np.eye(4)[[0, 0, 0, 0]])
+    vis = bare(sky)
+    assert ITERATED.measure(vis, sky).outcome == (Outcome.CONVERGED,)
+    twice = sky.select([0, 1, 2, 1, 2])
+    assert ITERATED.measure(vis, twice).outcome == (Outcome.SINGULAR,)
+    # within a patch it is no matter, nor when patches have only a part in common; but two patches may be alike, or a
+    # patch the sum of two sources
+    for patches, outcome in (
+        (("", "a", "b", "a", "b"), Outcome.CONVERGED),
+        (("", "a", "a", "", ""), Outcome.SINGULAR),
+        (("a", "a", "b", "", "b"), Outcome.CONVERGED),
+        (("", "a", "a", "b", "b"), Outcome.SINGULAR),
+    ):
+        found = ITERATED.measure(vis, twice.with_fields(patches=patches))
+        assert found.outcome == (outcome,), patches
+
+
+def test_a_point_and_a_gaussian_at_one_place_are_two_sources():
+    sky = polarized(count=3).select([0, 1, 1])
+    sky = sky.with_fields(major_rad=[0, 0, 5e-5], minor_rad=[0, 0, 5e-5], angle_rad=[0, 0, 0])
+    sky = sky.with_fields(stokes_jy=np.outer([3, 1, 2], np.ones(4)), names=("a", "b", "c"))
+    found = ITERATED.measure(bare(sky), sky)
+    assert found.outcome == (Outcome.CONVERGED,)
+    assert np.abs(found.stokes_jy[0] - sky.stokes_jy).max() < 1e-6
+
+
+def test_more_groups_than_data_cannot_be_measured():
+    sky = polarized(count=30)
+    vis = bare(sky)
+    flag = np.ones(vis.data.shape[:3], bool)
+    flag[5, :, :12] = False
+    assert ITERATED.measure(vis.flagged(flag), sky).outcome == (Outcome.SINGULAR,)
+
+
+def test_parts_of_a_patch_may_nearly_cancel():
+    sky = polarized(count=4, patches=True)
+    flux = np.outer([1000, -999.9, 5, 2], [1, 0, 0, 0])
+    sky = sky.with_fields(stokes_jy=flux)
+    vis = bare(sky)
+    for photometry in (ForcedPhotometry(), ForcedPhotometry(uv_range=(0, 1e7), accuracy=1e-13)):
+        found = photometry.measure(vis, sky)
+        assert found.outcome == (Outcome.CONVERGED,)
+        assert found.stokes_jy[0, :, 0] == pytest.approx([0.1, 5, 2], abs=1e-6)
+
+
+def test_a_source_without_stokes_i_is_not_measured_and_not_near_a_null():
+    sky = polarized(count=2).with_fields(stokes_jy=np.array([[1.0, 0, 0, 0], [0, 1, 0, 0]]))
+    leak = Analyzer(visibilities=bare(sky), sky=sky).leakage()
+    assert leak.near_null.tolist() == [False, False]
+    assert leak.measured.tolist() == [True, False]
+
+
+def test_expected_leakage_leaves_out_a_station_whose_beam_cannot_be_inverted():
+    sky = PointSky.at(CENTRE.spherical_offsets_by(2 * u.deg, 1.5 * u.deg), [1.0])
+    lofar = instrument.load("telescopes", "lofar-hba", stations=STATIONS[:5])
+    at = Scene(instrument=lofar, sky=sky, observation=night(interval=60 * u.min)).plan().full.at
+    whole, part = at.layout, replace(at.layout, names=at.layout.names[:4], positions_m=at.layout.positions_m[:4],
+                                     axes=at.layout.axes[:4])  # fmt: skip
+
+    class Dead:
+        """The fifth station is dead, or is not there."""
+
+        def jones(self, at):
+            every = replace(at, layout=whole)
+            out = np.array(np.broadcast_to(lofar.chain().jones(every), (*every.shape, 2, 2)))
+            out[:, :, 4:] = 0
+            return out[:, :, : len(at.layout)]
+
+    dead = expected_percent(Dead(), at, sky.stokes_jy)
+    assert np.isfinite(dead).all()
+    assert dead == pytest.approx(expected_percent(Dead(), replace(at, layout=part), sky.stokes_jy), rel=1e-9)
+    assert dead != pytest.approx(expected_percent(lofar.chain(), at, sky.stokes_jy), rel=1e-6)
