@@ -46,6 +46,8 @@ _HOME = {
     "JonesTable": "jones.table",
     "Calibrator": "calibrate.base",
     "Solution": "calibrate.base",
+    "DirectionalCal": "calibrate.directional",
+    "IncompleteModel": "analyze.laboratory",
     "Spectrum2D": "analyze.spectra",
     "SelfCal": "calibrate.selfcal",
     "read_h5parm": "files.solutions",

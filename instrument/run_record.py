@@ -171,18 +171,7 @@ def summary(result: Result) -> str:
     if result.calibration is not None:
         lines += ["", *result.calibration.summary()]
     if result.sweep is not None:
-        lines.append("")
-        lines.append(
-            "sources  of the flux  visibilities   image     bright sources: flux, position   others: flux, position"
-        )
-        for row in result.sweep.table():
-            image = f"{row['image_rms'].value:5.2f} %" if "image_rms" in row.colnames else ""
-            lines.append(
-                f"{row['n']:7d}  {row['flux_share'].value:9.1f} %  {row['visibility_rms'].value:10.2f} %  {image}"
-                f"  {row['bright_flux_median'].value:15.3f} %, {row['bright_shift_median'].value:.3f} arcsec"
-                f"  {row['unmodelled_flux_median'].value:8.2f} %, {row['unmodelled_shift_median'].value:.3f} arcsec"
-            )
-        lines.append("rms of what is left over the rms of the data or image; medians of errors of fluxes and positions")
+        lines += ["", *result.sweep.lines()]
     if result.fluxes is not None:
         bad = [o.value for o in result.fluxes.outcome if o is not Outcome.CONVERGED]
         lines += [f"photometry fell short: {text}" for text in bad]

@@ -103,6 +103,11 @@ class _Channel:
     power: Float = field(default_factory=lambda: np.zeros(4))  # sum of w |V|^2
     count: int = 0
 
+    def error(self, flux: Float) -> Float:
+        """Error of the fluxes (4,), from |V - A f|^2 = |V|^2 - f . A^H V at the solution; NaN without data."""
+        left = np.maximum(self.power - (flux * self.right).sum(axis=0), ROUNDING * self.power)
+        return np.sqrt(left / 2 / (self.total * self.count or np.nan))
+
 
 class PhotometrySums:
     """Adjoint sums over blocks of visibilities; `finish` solves for the fluxes."""
@@ -208,28 +213,18 @@ class PhotometrySums:
         if not self.channels:
             raise InputError("no visibilities were given to measure fluxes in")
         freqs = np.array(sorted(self.channels))
-        found, outcomes, errors, most = [], [], [], 0
-        for freq in freqs:
-            flux, outcome, count = self._solve(self.channels[float(freq)])
-            found.append(flux)
-            outcomes.append(outcome)
-            channel = self.channels[float(freq)]
-            # |V - A f|^2 = |V|^2 - f . A^H V at the solution
-            left = np.maximum(channel.power - (flux * channel.right).sum(axis=0), ROUNDING * channel.power)
-            errors.append(np.sqrt(left / 2 / (channel.total * channel.count or np.nan)))
-            most = max(most, count)
-        stokes = self.sky.stokes(freqs)
-        model = np.stack([_gathered(s, self.group, len(self.first)) for s in stokes])
+        channels = [self.channels[float(freq)] for freq in freqs]
+        fluxes, outcomes, counts = zip(*(self._solve(channel) for channel in channels), strict=True)
         return SourceFluxes(
             names=self.names,
             ra_rad=self.sky.ra_rad[self.first],
             dec_rad=self.sky.dec_rad[self.first],
-            model_jy=model,
-            stokes_jy=np.stack(found),
-            error_jy=np.stack(errors),
+            model_jy=np.stack([_gathered(s, self.group, len(self.first)) for s in self.sky.stokes(freqs)]),
+            stokes_jy=np.stack(fluxes),
+            error_jy=np.stack([channel.error(flux) for channel, flux in zip(channels, fluxes, strict=True)]),
             freq_hz=freqs,
-            outcome=tuple(outcomes),
-            iterations=most,
+            outcome=outcomes,
+            iterations=max(counts),
         )
 
     def _solve(self, channel: _Channel) -> tuple[Float, Outcome, int]:

@@ -163,6 +163,18 @@ class Sweep:
             out[f"north_{n}"] = self.shift_rad[k, :, 1] * ARCSEC * u.arcsec
         return out
 
+    def lines(self) -> list[str]:
+        """The table in short, for the terminal."""
+        out = ["sources  of the flux  visibilities   image     bright sources: flux, position   others: flux, position"]
+        for row in self.table():
+            image = f"{row['image_rms'].value:5.2f} %" if "image_rms" in row.colnames else ""
+            out.append(
+                f"{row['n']:7d}  {row['flux_share'].value:9.1f} %  {row['visibility_rms'].value:10.2f} %  {image}"
+                f"  {row['bright_flux_median'].value:15.3f} %, {row['bright_shift_median'].value:.3f} arcsec"
+                f"  {row['unmodelled_flux_median'].value:8.2f} %, {row['unmodelled_shift_median'].value:.3f} arcsec"
+            )
+        return [*out, "rms of what is left over the rms of data or image; medians of errors of fluxes and positions"]
+
     def write(self, folder: str | os.PathLike[str]) -> None:
         """Write sweep.ecsv, sources.ecsv and, where there are images, true.fits and residual-<n>.fits."""
         target = Path(folder)

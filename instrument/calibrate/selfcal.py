@@ -56,7 +56,9 @@ class SelfCal(Calibrator):
         stations = len(data.layout)
         shape = (len(times), len(channels))
         jones = np.concatenate([p.jones for p in parts]).reshape(*shape, stations, 2, 2)
-        slots = np.array([data.at.slots_s[t].mean() for t in times])
+        # the centre of a whole interval, also of a short last one: nearest must give every integration its own
+        reach = 0.5 * (max(t.stop - t.start for t in times) - 1) * data.interval_s
+        slots = np.array([data.at.slots_s[t.start] + reach for t in times])
         freqs = np.array([data.at.freq_hz[f].mean() for f in channels])
         outcome = np.empty(len(cells), object)
         outcome[:] = [o for p in parts for o in p.outcome]

@@ -128,6 +128,7 @@ def test_intervals_channels_and_weights_are_those_asked_for():
     data = truth.corrupted(still)
     solution = SelfCal(interval=40 * u.s, channels=2).solve(data, truth)
     assert solution.jones.shape == (3, 2, 10, 2, 2)  # 4 + 4 + 2 slots, 2 + 1 channels
+    assert solution.term.slots_s == pytest.approx(truth.at.slots_s[0] + np.array([15.0, 55.0, 95.0]))
     assert off(data, solution, truth) < 1e-9
     wrong = np.array(data.data)
     wrong[:, :, 3] = 1e6  # a broken baseline without weight
@@ -310,3 +311,11 @@ def test_solutions_interpolate_in_time_and_refuse_to_reach_outside():
     half = JonesTable(values=ramp, slots_s=ends, freq_hz=truth.at.freq_hz, stations=tuple("abcdefghij"))
     with pytest.raises(InputError, match="other stations"):
         half.jones(truth.at)
+
+
+def test_every_integration_is_corrected_with_its_own_interval_also_in_a_short_last_one():
+    truth = model(stations=FEW, slots=8)
+    steps = np.repeat([1.0, 2.0], [6, 2])  # intervals of 6 and 2
+    gains = GainTerm(values=steps[:, None, None, None] * np.ones((8, 1, 10, 2)), slots_s=truth.at.slots_s)
+    data = truth.corrupted(gains)
+    assert off(data, SelfCal(interval=60 * u.s).solve(data, truth), truth) < 1e-9
