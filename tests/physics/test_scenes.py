@@ -1,0 +1,80 @@
+"""Every shipped scene runs end to end, on fewer integrations and sources, and leaves what it promises."""
+
+import json
+
+import numpy as np
+import pytest
+from astropy.table import QTable
+
+from instrument import read_h5parm
+from instrument.cli import main
+from instrument.scene_file import shipped
+
+
+def ran(tmp_path, name, *settings):
+    words = [w for s in settings for w in ("--set", s)]
+    status = main(["run", name, "--out", str(tmp_path / "out"), *words])
+    folder = tmp_path / "out"
+    return status, folder, json.loads((folder / "run.json").read_text())
+
+
+def test_3c196_measures_its_brightest_sources(tmp_path):
+    status, folder, record = ran(
+        tmp_path, "3c196", "sky.brightest=60", "observation.interval='5 min'", "analyze.every=1", "image.pixels=128"
+    )
+    assert status == 0
+    table = QTable.read(folder / "leakage.ecsv")
+    assert len(table) == 60  # 3C196, four Gaussians, is one
+    centre = table[int(np.argmin(table["distance"]))]
+    assert centre["name"] == "3C196"
+    assert centre["I"].value == pytest.approx(83.1326, rel=2e-3)
+    assert centre["linear"].value < 0.05
+    use = table["measured"] & (table["distance"].value < 3)
+    gap = np.abs(table["linear"] - table["linear_expected"])[use].value
+    assert np.median(gap / table["linear_error"][use].value) < 4
+    assert record["checks"]["prediction"]["passed"]
+
+
+def test_di_errors_solves_what_was_put_in(tmp_path):
+    status, folder, record = ran(tmp_path, "di-errors", "observation.interval='10 min'", "image.pixels=64")
+    assert status == 0
+    table = QTable.read(folder / "di_errors.ecsv")
+    rows = {str(r["quantity"]): r for r in table}
+    for name in ("s", "iq", "uv", "iu", "qu", "iv", "qv"):
+        assert rows["linear, difference, aligned"][name].value < 1e-6
+        assert rows["quadratic, difference, raw"][name].value < 0.05
+    share = record["calibration"]["visibility_rms_share"]
+    assert share["corrected - model"] < 1e-10
+    assert 1e-3 < share["corrupted - corrected"] < 4e-3  # four errors of 1e-3 a visibility
+    assert read_h5parm(folder / "solutions.h5").values.shape == (48, 1, 59, 2, 2)
+    assert (folder / "gains.png").is_file()
+    assert (folder / "spectrum_2d.png").is_file()
+
+
+def test_incomplete_model_falls_with_the_number_of_sources(tmp_path):
+    status, folder, _ = ran(
+        tmp_path, "incomplete-model", "observation.interval='2 h'", "sky.brightest=400",
+        "calibrate.models=[1, 20, 400]", "image.pixels=64",
+    )  # fmt: skip
+    assert status == 0
+    table = QTable.read(folder / "sweep.ecsv")
+    assert np.all(np.diff(table["visibility_rms"].value) < 0)
+    assert np.all(np.diff(table["image_rms"].value) < 0)
+    assert table["visibility_rms"].value[-1] < 1e-3  # complete: the tolerance of the solve
+    assert (folder / "errors_against_model.png").is_file()
+
+
+def test_every_shipped_scene_has_a_plan(capsys):
+    for name in shipped():
+        assert main(["plan", name]) == 0
+        assert name in capsys.readouterr().out
+
+
+def test_a_wrong_calibration_is_refused_before_anything_runs(tmp_path, capsys):
+    for setting, word in (
+        ("calibrate.kind='selfcl'", "did you mean 'selfcal'"),
+        ("calibrate.patern='full'", "pattern"),
+    ):
+        assert main(["run", "di-errors", "--out", str(tmp_path / "out"), "--set", setting]) == 2
+        assert word in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
