@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import os
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import date, datetime
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Protocol, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from instrument.analyze.laboratory import IncompleteModel
+from instrument.analyze.many_directions import ManyDirections
 from instrument.analyze.photometry import ForcedPhotometry
+from instrument.calibrate.directional import DirectionalCal
 from instrument.calibrate.selfcal import SelfCal
 from instrument.component import Component
 from instrument.errors import FileError, InputError, did_you_mean
@@ -30,9 +32,16 @@ from instrument.scene import Scene
 from instrument.sky.base import Sky
 from instrument.units import Float, Hertz, HertzArray, Instant, Jansky, Seconds, SkyDirection
 
-CALIBRATIONS = ("selfcal", "incomplete-model")
+CALIBRATIONS = ("selfcal", "incomplete-model", "many-directions")
 STAGES = ("noise", "calibrate", "correct", "image", "analyze")
 SEED_STEP = 1000  # seeds of the stages of a scene are derived from its one seed
+
+
+class Laboratory(Protocol):
+    """What runs a plan by itself; its result has `table()`, `lines()` and `write(folder)`."""
+
+    def run(self, plan: Plan, progress: Callable[[float], None] | None = None) -> Any:
+        """The result."""
 
 
 class Frequency(Component):
@@ -160,14 +169,23 @@ class SceneFile(Component):
         with _in_table("calibrate"):
             return SelfCal(**settings) if kind == "selfcal" else None
 
-    def laboratory(self) -> IncompleteModel | None:
-        """The sweep over models of the table [calibrate], where its kind is "incomplete-model"."""
+    def laboratory(self) -> Laboratory | None:
+        """The laboratory of the table [calibrate], where its kind is "incomplete-model" or "many-directions".
+
+        Settings of `DirectionalCal` stand in the table beside those of `ManyDirections`.
+        """
         kind, settings = self._calibration()
-        if kind != "incomplete-model":
+        if kind not in ("incomplete-model", "many-directions"):
             return None
         noise = {} if self.noise is None else {"sefd": f"{self.noise.sefd!r} Jy"}
+        common = {"seed": SEED_STEP * self.seed + 3, **noise}
         with _in_table("calibrate"):
-            return IncompleteModel(**{"image": self.image, "seed": SEED_STEP * self.seed + 3, **noise, **settings})
+            if kind == "incomplete-model":
+                return IncompleteModel(**{"image": self.image, **common, **settings})
+            solver = {key: settings.pop(key) for key in DirectionalCal.model_fields if key in settings}
+            if solver:
+                settings["calibrator"] = DirectionalCal(**solver)
+            return ManyDirections(**{**common, **settings})
 
     def _calibration(self) -> tuple[str | None, dict[str, Any]]:
         """Kind and settings of the table [calibrate]."""

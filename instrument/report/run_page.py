@@ -8,6 +8,7 @@ from typing import Any
 
 from instrument.analyze.leakage import Leakage
 from instrument.analyze.spectra import Spectrum2D
+from instrument.analyze.subtraction import ManyDirectionsResult
 from instrument.analyze.sweep import Sweep
 from instrument.calibrate.base import Solution
 from instrument.calibrate.di_errors import DIComparison
@@ -47,7 +48,7 @@ def write_report(
     solution: Solution | None = None,
     errors: DIComparison | None = None,
     spectra: dict[str, Spectrum2D] | None = None,
-    sweep: Sweep | None = None,
+    sweep: Sweep | ManyDirectionsResult | None = None,
 ) -> None:
     """Draw the figures of a run into its folder and write `report.html`; `record` is what `run.json` holds."""
     entries: list[FigureEntry] = []
@@ -84,7 +85,12 @@ def write_report(
                 Table.of(errors.table(), "The seven direction-independent error parameters, in % of the rms put in.")
             )
         more.append(Section("Calibration", blocks))
-    if sweep is not None:
+    if isinstance(sweep, ManyDirectionsResult):
+        rows = Table.of(
+            sweep.table(), "Rms of visibilities; one: with one direction for all. Errors without the gauge."
+        )
+        more.append(Section("Many directions", [Text("\n".join(sweep.lines()), code=True), rows]))
+    elif sweep is not None:
         what = "Errors against the number of sources in the model."
         draw("errors_against_model", errors_against_model(sweep), what)
         rows = Table.of(sweep.table(), "One row a model of the n brightest sources.")
