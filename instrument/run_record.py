@@ -16,6 +16,7 @@ import numpy as np
 from instrument.analyze.leakage import CLEAR, Leakage
 from instrument.analyze.photometry import SourceFluxes
 from instrument.analyze.spectra import Spectrum2D
+from instrument.analyze.subtraction import ManyDirectionsResult
 from instrument.analyze.sweep import Sweep
 from instrument.calibration_run import CalibrationResult
 from instrument.doctor import package_version
@@ -41,7 +42,7 @@ class Result:
     leakage: Leakage | None = None
     calibration: CalibrationResult | None = None
     spectra: dict[str, Spectrum2D] = field(default_factory=dict)
-    sweep: Sweep | None = None
+    sweep: Sweep | ManyDirectionsResult | None = None
     check: Check | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -51,6 +52,7 @@ class Result:
         """Whether every check held: the bound is met and every solve converged."""
         solved = self.fluxes is None or all(o is Outcome.CONVERGED for o in self.fluxes.outcome)
         solved = solved and (self.calibration is None or self.calibration.passed)
+        solved = solved and (self.sweep is None or self.sweep.passed)
         return solved and (self.check is None or self.check.passed)
 
     @contextmanager
@@ -108,6 +110,8 @@ def record(result: Result, tables: dict[str, Any]) -> dict[str, Any]:
             "outcome": [o.value for o in set(result.calibration.solution.outcome.ravel())],
             "passed": result.calibration.passed,
         }
+    if result.sweep is not None:
+        out["checks"]["solutions"] = {"outcome": [], "passed": result.sweep.passed}
     if result.leakage is not None:
         out["leakage"] = {
             "inside_4_deg": result.leakage.inside(4.0),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -111,8 +112,10 @@ class _Job:
         self.sources = np.array([len(np.unique(rank[r])) for r in rows])
         self.flux_jy = np.array([sky.power_jy[r].sum() for r in rows])
         self.plans = [self._part(r) for r in rows]
-        self.powers: dict[str, float] = {}
-        self.samples = dict.fromkeys(("many", "one"), 0)
+        self.powers: dict[str, float] = {}  # sums of |x|^2, and over which visibilities
+        self.kinds: dict[str, str] = {}
+        self.outcomes: Counter[Outcome] = Counter()  # of intervals that failed
+        self.samples = dict.fromkeys(("all", "many", "one"), 0)
         self.unknowns = 0
         # of each cluster, and of one direction for all: intervals and those that failed; |error|^2 and elements
         self.solved, self.errors = np.zeros((len(names) + 1, 2)), np.zeros((len(names), 2))
@@ -179,14 +182,16 @@ class _Job:
             wrong = np.abs(own.aligned(held).jones - held) ** 2
             good = np.isfinite(wrong)
             self.errors[k] += wrong[good].sum(), good.sum()
+            self.outcomes.update(o for o in own.outcome.ravel() if o is not Outcome.CONVERGED)
             self.solved[k] += own.outcome.size, (own.outcome != Outcome.CONVERGED).sum()
             self.unknowns += own.converged.sum() * (
                 UNKNOWNS[settings.calibrator.pattern] * len(first.layout) - own.gauge.count
             )
         left = solution.subtracted(data, models)
         use = np.broadcast_to(~left.flag, left.data.shape[:3])
-        parts = {"data": data.data, "noise": (data - clean).data, "turning": clean.data - steady, "left": left.data}
-        self._sum("many", use, parts | {"wrong": left.data - (data - clean).data})
+        noise = data.data - clean.data
+        self._sum("all", np.ones_like(use), {"data": data.data, "noise": noise})
+        self._sum("many", use, {"turning": clean.data - steady, "left": left.data, "wrong": left.data - noise})
         model = first.with_data(np.sum([m.data for m in models.values()], axis=0))
         one = self.selfcal.solve(data, model)
         single = model.corrupted(one.term).data
@@ -197,12 +202,12 @@ class _Job:
     def _sum(self, kind: str, use: Bool, parts: dict[str, Complex]) -> None:
         self.samples[kind] += 4 * int(use.sum())
         for name, part in parts.items():
+            self.kinds[name] = kind
             self.powers[name] = self.powers.get(name, 0.0) + float((np.abs(part[use]) ** 2).sum())
 
     def finish(self) -> ManyDirectionsResult:
         """What was measured."""
-        one = {name: self.samples["one" if name.startswith("one") else "many"] for name in self.powers}
-        power = {name: value / one[name] if one[name] else np.nan for name, value in self.powers.items()}
+        power = {name: value / (self.samples[self.kinds[name]] or np.nan) for name, value in self.powers.items()}
         taken = min(1.0, self.unknowns / max(2 * self.samples["many"], 1))
         power["due"] = power["noise"] * (1 - taken) + power.pop("turning")
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -210,7 +215,8 @@ class _Job:
         failed = self.solved[:, 1] / self.solved[:, 0]
         return ManyDirectionsResult(
             names=tuple(self.names), sources=self.sources, flux_jy=self.flux_jy, error=error, failed=failed[:-1],
-            one_failed=float(failed[-1]), **{f"{name}_jy": float(np.sqrt(value)) for name, value in power.items()},
+            one_failed=float(failed[-1]), failures=tuple(f"{n} {o.value}" for o, n in self.outcomes.most_common()),
+            **{f"{name}_jy": float(np.sqrt(value)) for name, value in power.items()},
         )  # fmt: skip
 
 

@@ -21,7 +21,7 @@ class ManyDirectionsResult:
     removed (what a model hardly sees is no gauge: noise fills it); `failed` (C,) is the share of intervals without a
     solution. `left_jy` remains of the data after subtraction, `due_jy` is what the noise, less the degrees of freedom
     of the solution, and the turning within intervals leave; `wrong_jy` is what was subtracted less the noiseless data.
-    `one_*` are those of one direction for all. A patch counts as one source.
+    `one_*` are those of one direction for all. `failures` says how intervals failed.
     """
 
     names: tuple[str, ...]
@@ -37,6 +37,7 @@ class ManyDirectionsResult:
     one_left_jy: float
     one_wrong_jy: float
     one_failed: float
+    failures: tuple[str, ...] = ()
 
     @property
     def passed(self) -> bool:
@@ -84,6 +85,7 @@ class ManyDirectionsResult:
         lines = ["cluster         sources   flux Jy   error of matrices   failed %"]
         for row in zip(self.names, self.sources, self.flux_jy, self.error, 100 * self.failed, strict=True):
             lines.append("{:<15} {:7d} {:9.2f} {:19.2g} {:10.1f}".format(*row))
+        lines += [f"intervals that failed       {text}" for text in self.failures]
         unit = "the noise" if self.noise_jy else "the data"
         form = ".3f" if self.noise_jy else ".1e"
         due, wrong, one, one_wrong = (

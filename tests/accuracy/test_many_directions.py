@@ -113,7 +113,7 @@ def test_intervals_that_fail_are_counted_and_left_out():
     found = ManyDirections(clusters=4, calibrator=cal).run(plan(2))
     assert not found.passed and np.all(found.failed == 1)
     assert np.isnan(found.left) and np.all(np.isnan(found.error))
-    assert np.isfinite(found.one_left_jy)
+    assert np.isfinite(found.one_left_jy) and "8 stopped at the iteration limit" in "\n".join(found.lines())
     assert found.lines() and len(found.table()) == 5
 
 

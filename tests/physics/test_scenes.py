@@ -64,6 +64,17 @@ def test_incomplete_model_falls_with_the_number_of_sources(tmp_path):
     assert (folder / "errors_against_model.png").is_file()
 
 
+def test_many_directions_leaves_the_noise_and_one_direction_more(tmp_path, capsys):
+    status, folder, record = ran(tmp_path, "many-directions", "observation.duration='4 min'")
+    assert status == 0
+    said = capsys.readouterr().out
+    left = float(said.split("left after subtraction")[1].split()[0])
+    one = float(said.split("with one direction for all")[1].split()[0])
+    assert left < 1.1 < one
+    assert record["checks"]["solutions"]["passed"]
+    assert list(folder.glob("*.ecsv"))
+
+
 def test_every_shipped_scene_has_a_plan(capsys):
     for name in shipped():
         assert main(["plan", name]) == 0
