@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+import warnings
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from instrument.errors import InputError, RefusedError, did_you_mean
+from instrument.errors import InputError, InstrumentWarning, RefusedError, did_you_mean
 from instrument.jones.chain import Chain
 from instrument.model import Instrument, warn_outside_band
 from instrument.observe.directions import EARTH_RATE, LIGHT, separation
@@ -56,6 +57,13 @@ def make_plan(
     limit = _limit(memory)
     workers = workers or os.cpu_count() or 1
     shape, work, peak = _blocks(found, problem, workers, limit)
+    rounding = _rounding(problem)
+    if 0 < tolerance < rounding:
+        warnings.warn(
+            f"tolerance = {tolerance:g} is below what float64 can promise here, {rounding:.1e}",
+            InstrumentWarning,
+            stacklevel=3,
+        )
     return Plan(
         name=name,
         full=replace(full, antenna1=problem.antenna1, antenna2=problem.antenna2),
@@ -72,7 +80,7 @@ def make_plan(
         memory=peak,
         limit=limit,
         tolerance=tolerance,
-        bounds=(Item("float64 sums", "", _rounding(problem)),),
+        bounds=(Item("float64 sums", "", rounding),),
         scale_jy=_total_flux(full),
         seconds=work.seconds / workers,
     )

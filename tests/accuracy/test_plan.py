@@ -10,7 +10,7 @@ from astropy import units as u
 from astropy.coordinates import SkyCoord
 
 import instrument
-from instrument import GainTerm, InputError, Observation, PointSky, Scene
+from instrument import GainTerm, InputError, InstrumentWarning, Observation, PointSky, Scene
 from instrument.errors import RefusedError
 from instrument.predict.direct import Direct
 
@@ -77,6 +77,11 @@ def test_tolerance_is_honoured(tolerance):
     check = plan.verify(samples=24, seed=1)
     assert check.passed
     assert check.bound == plan.error_bound
+
+
+def test_a_tolerance_that_float64_cannot_keep_is_said_to_be_one():
+    with pytest.warns(InstrumentWarning, match="below what float64 can promise"):
+        scene().plan(tolerance=1e-15)
 
 
 def test_verify_finds_a_wrong_engine():
