@@ -19,6 +19,7 @@ from instrument.image.dirty import Images
 from instrument.jones.chain import Chain
 from instrument.model import Instrument
 from instrument.visibilities import Visibilities
+from instrument.whole_file import write_ecsv
 
 IMAGES = ("corrupted", "corrected", "corrupted - corrected", "corrected - model")
 
@@ -108,8 +109,7 @@ class CalibrationResult:
         """solutions.h5 (h5parm) and di_errors.ecsv."""
         write_h5parm(folder / "solutions.h5", self.solution)
         if self.errors is not None:
-            target = folder / "di_errors.ecsv"
-            self.errors.table().write(str(target), format="ascii.ecsv", overwrite=True)
+            write_ecsv(self.errors.table(), folder / "di_errors.ecsv")
 
     def summary(self) -> list[str]:
         """Lines for the terminal."""

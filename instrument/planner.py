@@ -80,7 +80,7 @@ def make_plan(
         memory=peak,
         limit=limit,
         tolerance=tolerance,
-        bounds=(Item("float64 sums", "", rounding),),
+        bounds=(Item(_rounding_name(problem), "", rounding),),
         scale_jy=_total_flux(full),
         seconds=work.seconds / workers,
     )
@@ -274,11 +274,18 @@ def _rounding(problem: Problem) -> float:
     eps = float(np.finfo(float).eps)
     reach = np.abs(problem.at.lmn).max(axis=0).sum() if len(problem.at.lmn) else 0.0
     waves = problem.at.layout.longest_m * float(problem.at.freq_hz.max()) / LIGHT
-    gain = problem.chain.peak(problem.at) ** 2
+    peak = problem.chain.peak(problem.at)
+    gain = peak**2 if np.isfinite(peak) else 1.0  # the plan then says that it is assumed
     # 4 roundings in each of two phases, and 4 of direction cosines, which are good to eps of 1 and not of themselves;
     # 30 in the Jones matrices; the sum itself over S sources, worst case. Gains above 1 amplify it
-    largest = max(1.0, gain) if np.isfinite(gain) else 1.0
+    largest = max(1.0, gain)
     return largest * eps * (2 * np.pi * (8 * waves * float(reach) + 4 * waves) + 30 + problem.at.shape[3])
+
+
+def _rounding_name(problem: Problem) -> str:
+    """What the bound on rounding is of, and what it takes for granted where a term knows no bound of its own."""
+    unknown = [type(t).__name__ for t in problem.chain.parts if not np.isfinite(t.peak(problem.at))]
+    return f"float64 sums where {', '.join(unknown)} stays below 1:" if unknown else "float64 sums"
 
 
 def _total_flux(problem: Problem) -> float:

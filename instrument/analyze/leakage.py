@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from instrument.jones.mueller import TO_LINEAR, TO_STOKES
 from instrument.observe.directions import separation
 from instrument.observe.sampling import Sampling
 from instrument.units import Bool, Complex, Direction, Float, unit_vectors
+from instrument.whole_file import write_ecsv
 
 NULL = 0.01  # apparent over true flux below which a source lies near a null of the beam
 CLEAR, SURE = 0.1, 3.0  # a leakage counts as measured when its error is below 0.1 % of I, or a third of itself
@@ -107,10 +107,7 @@ class Leakage:
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the table as ECSV."""
-        target = Path(path)
-        partial = target.with_name(target.name + ".part")
-        self.table().write(str(partial), format="ascii.ecsv", overwrite=True)
-        partial.replace(target)
+        write_ecsv(self.table(), path)
 
     def rings(self, edges_deg: tuple[float, ...] = (0.1, 1, 2, 3, 4, 5)) -> list[dict[str, float]]:
         """Median and maximum leakage of measured sources in rings about the centre, the first within the first edge."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import warnings
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -13,6 +12,7 @@ import numpy as np
 from instrument.errors import InputError, InstrumentWarning, did_you_mean
 from instrument.image.cube import StokesCube
 from instrument.units import Complex, Float, Int, to_si
+from instrument.whole_file import write_ecsv
 
 HYDROGEN = 1420405751.768  # Hz, the 21-cm line at rest
 Stokes = Literal["I", "Q", "U", "V", "P"]
@@ -70,10 +70,7 @@ class Spectrum2D:
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the table as ECSV; the file is whole or not there."""
-        target = Path(path)
-        partial = target.with_name(target.name + ".part")
-        self.table().write(str(partial), format="ascii.ecsv", overwrite=True)
-        partial.replace(target)
+        write_ecsv(self.table(), path)
 
 
 def ratio(a: Spectrum2D, b: Spectrum2D) -> Float:

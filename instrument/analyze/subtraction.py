@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from instrument.units import Float, Int
+from instrument.whole_file import write_ecsv
 
 
 @dataclass(frozen=True)
@@ -102,6 +103,4 @@ class ManyDirectionsResult:
         """Write many_directions.ecsv."""
         target = Path(folder)
         target.mkdir(parents=True, exist_ok=True)
-        partial = target / "many_directions.ecsv.part"
-        self.table().write(str(partial), format="ascii.ecsv", overwrite=True)
-        partial.replace(target / "many_directions.ecsv")
+        write_ecsv(self.table(), target / "many_directions.ecsv")

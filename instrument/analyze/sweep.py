@@ -16,6 +16,7 @@ from instrument.image.cube import StokesCube
 from instrument.observe.directions import lmn, offset
 from instrument.sky.points import PointSky
 from instrument.units import Bool, Float, Int
+from instrument.whole_file import write_ecsv
 
 ARCSEC = float(np.rad2deg(1) * 3600)
 
@@ -180,9 +181,7 @@ class Sweep:
         target = Path(folder)
         target.mkdir(parents=True, exist_ok=True)
         for name, table in (("sweep", self.table()), ("sources", self.source_table())):
-            partial = target / f"{name}.ecsv.part"
-            table.write(str(partial), format="ascii.ecsv", overwrite=True)
-            partial.replace(target / f"{name}.ecsv")
+            write_ecsv(table, target / f"{name}.ecsv")
         if self.reference is not None:
             self.reference.write(target / "true.fits")
         for n, cube in zip(self.models, self.residuals, strict=False):

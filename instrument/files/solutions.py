@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from importlib import metadata
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -22,6 +21,7 @@ from instrument.jones.table import JonesTable
 from instrument.observe.layout import Layout
 from instrument.observe.sampling import Sampling
 from instrument.units import Complex
+from instrument.whole_file import whole_file
 
 Pattern = Literal["full", "diagonal", "scalar", "phase"]
 
@@ -59,12 +59,10 @@ def write_h5parm(
     if isinstance(solution, Solution):
         history += f"\n{solution}"
 
-    target = Path(path)
-    partial = target.with_name(target.name + ".part")
     import h5py
 
     try:
-        with h5py.File(partial, "w") as store:
+        with whole_file(path) as partial, h5py.File(partial, "w") as store:
             solset = store.create_group("sol000")
             solset.attrs["h5parm_version"] = np.bytes_("1.0")
             solset["antenna"], solset["source"] = _antenna(names, at), _source(at)
@@ -77,7 +75,6 @@ def write_h5parm(
                     soltab[name] = array.reshape([len(along[axis]) for axis in axes])
                     soltab[name].attrs["AXES"] = np.bytes_(",".join(axes))
                 soltab["val"].attrs["HISTORY000"] = np.bytes_(history.encode())
-        partial.replace(target)
     except OSError as error:
         raise FileError(f"{path} cannot be written: {one_line(error)}") from None
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy as np
 from instrument.errors import InputError
 from instrument.observe.directions import LIGHT
 from instrument.units import Direction, Float, to_si
+from instrument.whole_file import whole_file
 
 BOLTZMANN = 1.380649e-23  # J/K
 JY = 1e-26  # W m^-2 Hz^-1
@@ -136,7 +136,5 @@ class StokesCube:
                 ):
                     columns.append(fits.Column(name, "D", "deg", array=np.rad2deg(values)))
             hdus.append(fits.BinTableHDU.from_columns(columns, name="BEAMS"))
-        target = Path(path)
-        partial = target.with_name(target.name + ".part")
-        fits.HDUList(hdus).writeto(partial, overwrite=True)
-        partial.replace(target)
+        with whole_file(path) as partial:
+            fits.HDUList(hdus).writeto(partial, overwrite=True)

@@ -57,8 +57,13 @@ class JonesTerm(Component):
         return (self,)
 
     def peak(self, at: Sampling) -> float:
-        """A bound on the largest singular value of the term at any time, station and direction; infinity if unknown."""
-        return float("inf")
+        """A bound on the largest singular value of the term at any time, station and direction; infinity if unknown.
+
+        For a term without direction it is the largest that occurs; a directional one says what it knows.
+        """
+        if self.directional:
+            return float("inf")
+        return float(np.nanmax(mat2.singular_values(self.jones(at))[0], initial=0.0))
 
     def sharing(self, at: Sampling) -> str:
         """How many different matrices the stations of an array need of this term, in words."""

@@ -66,10 +66,6 @@ class StationTable(JonesTerm):
             out = out + self.rms * drawn[:, None]
         return out
 
-    def peak(self, at: Sampling) -> float:
-        """The largest singular value that occurs."""
-        return float(mat2.singular_values(self.jones(at))[0].max())
-
     def simplify(self, at: Sampling, tolerance: float) -> Simplified:
         """Leaves the term out when it is exactly the identity."""
         plain = self.values is None or np.all(self.values == self.neutral)

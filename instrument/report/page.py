@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from instrument.errors import FileError
+from instrument.whole_file import whole_file
 
 Mark = Literal["", "good", "bad"]
 MOST_ROWS = 2000  # of a table in the page: a phone still scrolls them
@@ -152,11 +153,9 @@ def write_page(page: Page, path: str | os.PathLike[str]) -> Path:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    target = Path(path)
-    partial = target.with_name(target.name + ".part")
-    partial.write_text(here.get_template("page.html").render(page=page), encoding="utf-8")
-    partial.replace(target)
-    return target
+    with whole_file(path) as partial:
+        partial.write_text(here.get_template("page.html").render(page=page), encoding="utf-8")
+    return Path(path)
 
 
 def number(value: Any, digits: int = 3) -> str:

@@ -12,6 +12,8 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from instrument.whole_file import whole_file
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -48,8 +50,6 @@ def save(drawing: Figure | Axes, path: str | os.PathLike[str]) -> Path:
     figure: Any = drawing if isinstance(drawing, Figure) else drawing.figure
     while not isinstance(figure, Figure):  # axes of a subfigure
         figure = figure.figure
-    target = Path(path)
-    partial = target.with_name(target.name + ".part")
-    figure.savefig(partial, format="png", dpi=150, bbox_inches="tight", facecolor="white")
-    partial.replace(target)
-    return target
+    with whole_file(path) as partial:
+        figure.savefig(partial, format="png", dpi=150, bbox_inches="tight", facecolor="white")
+    return Path(path)

@@ -8,9 +8,21 @@ import numpy as np
 import pytest
 from astropy import units as u
 from astropy.coordinates import SkyCoord
+from instrument_plugins.elements.dipole import CrossedDipole
 
 import instrument
-from instrument import GainTerm, InputError, InstrumentWarning, Observation, PointSky, Scene
+from instrument import (
+    Chain,
+    Composed,
+    ElementBeam,
+    GainTerm,
+    InputError,
+    InstrumentWarning,
+    Observation,
+    Parallactic,
+    PointSky,
+    Scene,
+)
 from instrument.errors import RefusedError
 from instrument.predict.direct import Direct
 
@@ -208,3 +220,17 @@ def test_impossible_scenes_are_refused_before_anything_runs():
         scene(PointSky.at(CENTRE, [0.0])).plan()
     with pytest.raises(InputError, match="source 's0' is not finite"):
         PointSky.at(CENTRE, [np.nan])
+
+
+def test_a_beam_without_a_known_peak_is_named_in_the_bound_and_its_faint_sources_stay():
+    class Own(ElementBeam):
+        def jones(self, at):
+            return 3.0 * CrossedDipole(height=0.5 * u.m).jones(at)
+
+    lofar = instrument.load("telescopes", "lofar-hba", stations=STATIONS)
+    own = Composed(stations=lofar.layout(), terms=Chain(Own(), Parallactic()))
+    plan = scene().with_fields(instrument=own).plan(tolerance=1e-2)
+    assert "float64 sums where Own stays below 1" in str(plan)
+    assert not any("faint" in name for name in names(plan.left_out))
+    known = Composed(stations=lofar.layout(), terms=Chain(GainTerm(rms=0.1, seed=1), CrossedDipole(height=0.5 * u.m)))
+    assert names(scene().with_fields(instrument=known).plan().bounds) == ["float64 sums"]

@@ -21,7 +21,7 @@ HEAVY = {"astropy", "scipy", "numba", "matplotlib", "ducc0", "h5py", "jinja2", "
 # In the order in which imports may run: a group may import the groups of the lines above it, and within itself. A name
 # stands for a module or for a whole package.
 LAYERS = (
-    ("errors", "data", "scenes"),
+    ("errors", "data", "scenes", "whole_file"),
     ("units",),
     ("registry", "mat2", "phasor"),
     ("component",),
