@@ -18,7 +18,7 @@ from instrument.units import Bool, Complex, Direction, Float, unit_vectors
 from instrument.whole_file import write_ecsv
 
 NULL = 0.01  # apparent over true flux below which a source lies near a null of the beam
-CLEAR, SURE = 0.1, 3.0  # a leakage counts as measured when its error is below 0.1 % of I, or a third of itself
+CLEAR = 0.1  # % of I: error up to which a leakage counts as measured; never by its own value, which would select
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Leakage:
         """Which sources have a leakage that says something (G,)."""
         with np.errstate(invalid="ignore"):
             error = self.error_percent[:, 0]
-            known = (error <= CLEAR) | (SURE * error <= self.linear_percent)
+            known = error <= CLEAR
         return known & ~self.near_null & (self.model_jy[:, 0] != 0)
 
     def table(self) -> Any:
