@@ -56,8 +56,12 @@ _HOME = {
     "StokesCube": "image.cube",
     "Analyzer": "analyze.analyzer",
     "Leakage": "analyze.leakage",
+    "Cylindrical": "analyze.cylinders",
+    "Spherical": "analyze.cylinders",
+    "Signal21cm": "analyze.signal",
+    "EoRWindow": "analyze.window",
 }
-_MODULES = ("conformance", "mueller", "units")
+_MODULES = ("conformance", "ixr", "mueller", "units")
 __all__ = [*_HOME, *_MODULES, "__version__"]
 
 if TYPE_CHECKING:
@@ -73,7 +77,8 @@ def __getattr__(name: str) -> Any:
         globals()[name] = found
         return found
     if name in _MODULES:
-        return import_module("instrument.jones.mueller" if name == "mueller" else f"instrument.{name}")
+        home = {"mueller": "jones.mueller", "ixr": "analyze.ixr"}
+        return import_module(f"instrument.{home.get(name, name)}")
     raise AttributeError(f"module 'instrument' has no attribute '{name}'")
 
 

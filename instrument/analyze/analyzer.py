@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import os
+from collections.abc import Callable, Iterable
 from typing import Any
 
+from instrument.analyze.cells import Cells, cells_of
+from instrument.analyze.cylinders import Cylindrical, Spherical, cylindrical, spherical
+from instrument.analyze.faraday import FaradayCube, Precision, rm_synthesis
+from instrument.analyze.fourier import Stokes, Taper
 from instrument.analyze.leakage import Leakage, leakage_of
 from instrument.analyze.photometry import ForcedPhotometry, SourceFluxes
-from instrument.analyze.spectra import Spectrum2D, Stokes, Taper, spectrum_2d
+from instrument.analyze.signal import Signal21cm
+from instrument.analyze.spectra import Spectrum2D, spectrum_2d
+from instrument.analyze.window import EoRWindow, eor_window
 from instrument.errors import InputError
 from instrument.image.cube import StokesCube
 from instrument.sky.base import Sky
@@ -75,6 +82,144 @@ class Analyzer:
         if self.cube is None:
             raise InputError("spectrum_2d needs a cube: Analyzer(cube)")
         return spectrum_2d(self.cube, stokes, channel, uv_range, taper, bins, log, redshift, cosmology)
+
+    def cells(
+        self,
+        stokes: Stokes = "I",
+        taper: Taper | None = "blackman-harris",
+        taper_space: Taper | None = None,
+        uv_range: tuple[float, float] | None = None,
+        cross: StokesCube | None = None,
+        psf_corrected: bool = False,
+        infill: Any = None,
+        redshift: float | None = None,
+        cosmology: Any = None,
+    ) -> Cells:
+        """Power in every Fourier cell of the cube, to make several spectra from: `.cylindrical()`, `.spherical()`.
+
+        `taper` goes along frequency: without one smooth spectra spill over all k_par (3e-6 of their power at 0.9 /Mpc;
+        4e-14 behind "blackman-harris"). `taper_space` goes over both axes of the images: a field that is not periodic
+        is 12 to 20 % too high without. The level of white noise is kept. `uv_range` (wavelengths) keeps the cells of
+        those baselines. `cross` is a second cube (the other half of the data): the real part of one across the other,
+        without the bias of their noise. `psf_corrected` divides by the response of the PSF; cells below 5 % of the
+        largest are left out. Channels that are missing or all NaN are refused, or with `infill` (a delay, 300 ns) made
+        from the others as if no delay were larger: smooth foregrounds to 1e-6, noise and signal not at all. A line of
+        sight that holds NaN counts as zero, its share is made up for, and a warning says so. One redshift, of the
+        middle of the band unless given, serves all of it.
+        """
+        if self.cube is None:
+            raise InputError("power spectra need a cube: Analyzer(cube)")
+        return cells_of(
+            self.cube, stokes, taper, taper_space, uv_range, cross, psf_corrected, infill, redshift, cosmology
+        )
+
+    def cylindrical(
+        self,
+        stokes: Stokes = "I",
+        taper: Taper | None = "blackman-harris",
+        taper_space: Taper | None = None,
+        uv_range: tuple[float, float] | None = None,
+        bins: Any = 15,
+        bins_par: Any = None,
+        log: bool = True,
+        paper_axis: bool = False,
+        cross: StokesCube | None = None,
+        psf_corrected: bool = False,
+        infill: Any = None,
+        redshift: float | None = None,
+        cosmology: Any = None,
+    ) -> Cylindrical:
+        """Power spectrum of the cube in bins of k_perp and |k_par|, `cube.unit`² Mpc³; "P" is Q + iU.
+
+        `bins` of k_perp and `bins_par` of k_par are their number, equal in ln k (`log`) or in k, or edges with a unit;
+        by default every delay is a bin of k_par, up to Nyquist, 1/(2 dnu). `paper_axis` goes on to 1/dnu, where all
+        is a mirror image, to redraw published figures. Log bins leave k = 0 out. The rest as in `cells`.
+        """
+        made = self.cells(stokes, taper, taper_space, uv_range, cross, psf_corrected, infill, redshift, cosmology)
+        return cylindrical(made, bins, bins_par, log, paper_axis)
+
+    def spherical(
+        self,
+        stokes: Stokes = "I",
+        taper: Taper | None = "blackman-harris",
+        taper_space: Taper | None = None,
+        uv_range: tuple[float, float] | None = None,
+        bins: Any = 15,
+        log: bool = True,
+        wedge: Any = None,
+        k_par_min: Any = None,
+        cross: StokesCube | None = None,
+        psf_corrected: bool = False,
+        infill: Any = None,
+        redshift: float | None = None,
+        cosmology: Any = None,
+    ) -> Spherical:
+        """Power spectrum of the cube in bins of k, `cube.unit`² Mpc³; "P" is Q + iU.
+
+        `wedge` (an angle from the phase centre) and `k_par_min` leave out the cells below them. The rest as in `cells`
+        and `cylindrical`.
+        """
+        made = self.cells(stokes, taper, taper_space, uv_range, cross, psf_corrected, infill, redshift, cosmology)
+        return spherical(made, bins, log, wedge, k_par_min)
+
+    def eor_window(
+        self,
+        signal: Signal21cm,
+        stokes: Stokes = "I",
+        noise: StokesCube | None = None,
+        wedge: Any = None,
+        k_par_min: Any = 0.0,
+        taper: Taper | None = "blackman-harris",
+        taper_space: Taper | None = "hann",
+        uv_range: tuple[float, float] | None = None,
+        bins: Any = 10,
+        bins_par: Any = 10,
+        redshift: float | None = None,
+        cosmology: Any = None,
+    ) -> EoRWindow:
+        """Where in (k_perp, k_par) the leakage that this cube holds stays below a 21-cm spectrum.
+
+        `noise` is a cube of noise alone, added to the leakage; `wedge` an angle from the phase centre below whose line
+        no bin counts, `k_par_min` the same for a line across. The cube must be in K.
+        """
+
+        def spectrum(cube: StokesCube) -> Cylindrical:
+            made = Analyzer(cube).cells(stokes, taper, taper_space, uv_range, redshift=redshift, cosmology=cosmology)
+            return made.cylindrical(bins, bins_par)
+
+        if self.cube is None:
+            raise InputError("eor_window needs a cube: Analyzer(cube)")
+        return eor_window(spectrum(self.cube), signal, None if noise is None else spectrum(noise), wedge, k_par_min)
+
+    def rm_synthesis(
+        self,
+        depths: Any,
+        stokes: Stokes = "P",
+        weights: Any = None,
+        lambda2_0: Any = None,
+        spectral_index: float | None = None,
+        divide_by_i: bool = False,
+        precision: Precision | None = None,
+        out: str | os.PathLike[str] | None = None,
+        noise: Any = None,
+        progress: Callable[[float], None] | None = None,
+    ) -> FaradayCube:
+        """Faraday dispersion function at `depths` in rad/m², bare or a `Quantity`, in any order; see `FaradayCube`.
+
+        "P" is Q + iU; of a real Stokes parameter F(-phi) is the conjugate of F(phi). `weights` (F,), such as
+        1 / sigma²; a channel of weight 0 or without data counts nowhere, lambda²_0 included; a voxel that is NaN is left
+        out of the sums of its pixel. `lambda2_0` in m² is the weighted mean of lambda²; 0 makes phases those of the
+        emission. `spectral_index` a divides by (nu/nu0)^a; `divide_by_i` divides each voxel by Stokes I (I <= 0 or
+        not finite: left out) and multiplies F with I at nu0, of the power law fitted to I of the pixel; nu0 is the
+        frequency of the mean lambda². `noise`, sigma of Q and U in the unit of the cube, one or (F,), becomes that of F.
+        `precision` "single" or "double" is that of the cube; single is good to 4e-7 of the largest |F|. `out` names a
+        .npy file for F, which is then mapped: memory does not grow with it. `progress` is called with the fraction done.
+        Raises `InputError` for infinite values, for a cube without data, and for depths that are not numbers.
+        """
+        if self.cube is None:
+            raise InputError("rm_synthesis needs a cube: Analyzer(cube)")
+        given = (depths, stokes, weights, lambda2_0, spectral_index, divide_by_i, precision, out, noise, progress)
+        return rm_synthesis(self.cube, *given)
 
     def _centre(self) -> Direction:
         found = self.centre or (self.cube.centre if self.cube is not None else None)

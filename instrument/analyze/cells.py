@@ -1,0 +1,337 @@
+"""Fourier cells of a cube: power over cells (u, v) and delays, in double precision and bounded blocks."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from instrument.analyze.fourier import Stokes, Taper, check_stokes, comoving, line_of_sight, taper_of, uv_limits
+from instrument.errors import InputError, InstrumentWarning
+from instrument.image.cube import StokesCube
+from instrument.units import Bool, Complex, Float, Int, to_si
+
+if TYPE_CHECKING:
+    from instrument.analyze.cylinders import Cylindrical, Spherical
+
+BLOCK = 8  # channels transformed at once: 8 images of 480 x 480 are 15 MB
+WEAK = 0.05  # of the largest response of a PSF: cells below it are not divided by it, but left out
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What a cube's cells mean in space: redshift, distances in Mpc, and what was done before the transform."""
+
+    unit: str
+    stokes: str
+    freq_hz: float  # middle of the band
+    redshift: float  # one for the whole band
+    distance_mpc: float  # transverse comoving: k_perp = 2 pi uv / distance
+    depth_mpc_per_hz: float  # along the line of sight: k_par = 2 pi delay / depth
+    taper: str | None
+    taper_space: str | None
+    uv_range: tuple[float, float] | None  # wavelengths
+    missing: float  # share of the lines of sight with NaN, which count as zero
+    infilled: int  # channels without data that were filled in
+    psf_corrected: bool
+
+    @property
+    def horizon_slope(self) -> float:
+        """k_par / k_perp of the horizon, D H(z) / (c (1+z)): 3.59 at 150 MHz; of an angle, its sine times that."""
+        return self.distance_mpc / (self.freq_hz * self.depth_mpc_per_hz)
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Power (M, N) in `unit`² Mpc³ of N cells (u, v), by |u|, and M delays from 0 to Nyquist, both signs averaged.
+
+    A cell stands for `times` (N,) cells of the plane and a delay for `folds` (M,); N by M is what a cube has. `auto` is
+    the geometric mean of the two powers where `power` is that of one cube across another, and the same without.
+    """
+
+    frame: Frame
+    k_perp: Float  # (N,), 1/Mpc, growing
+    k_par: Float  # (M,), 1/Mpc, growing from 0
+    power: Float
+    auto: Float
+    times: Float
+    folds: Float
+    modes: float  # independent modes in each cell counted: 1/2 of a real field, fewer behind a taper
+    left_out: dict[str, int]
+
+    def cylindrical(
+        self, bins: Any = 15, bins_par: Any = None, log: bool = True, paper_axis: bool = False
+    ) -> Cylindrical:
+        """Spectrum in bins of k_perp and k_par; see `Analyzer.cylindrical`."""
+        from instrument.analyze.cylinders import cylindrical
+
+        return cylindrical(self, bins, bins_par, log, paper_axis)
+
+    def spherical(self, bins: Any = 15, log: bool = True, wedge: Any = None, k_par_min: Any = None) -> Spherical:
+        """Spectrum in bins of k; see `Analyzer.spherical`."""
+        from instrument.analyze.cylinders import spherical
+
+        return spherical(self, bins, log, wedge, k_par_min)
+
+    def sums(self, bounds: Int, row: Float) -> Float:
+        """Sums (P,) over cells bounds[i] <= n < bounds[i+1] of one row (N,), weighted by `times`."""
+        filled = np.diff(bounds) > 0
+        out = np.zeros(len(bounds) - 1)
+        # differences of a running sum would bury a faint bin behind a bright one
+        if filled.any():
+            ends = np.append(bounds[:-1][filled], bounds[-1])
+            out[filled] = np.add.reduceat(np.append(row * self.times, 0.0)[: ends[-1] + 1], ends)[:-1]
+        return out
+
+
+def cells_of(
+    cube: StokesCube,
+    stokes: Stokes = "I",
+    taper: Taper | None = "blackman-harris",
+    taper_space: Taper | None = None,
+    uv_range: tuple[float, float] | None = None,
+    cross: StokesCube | None = None,
+    psf_corrected: bool = False,
+    infill: Any = None,
+    redshift: float | None = None,
+    cosmology: Any = None,
+) -> Cells:
+    """Cells of a cube, or of one cube across another (the real part); see `Analyzer.cylindrical`.
+
+    P = V / N² |DFT(w x)|² / mean w² (V the comoving volume, N the voxels): its sum over all cells over V is the
+    variance (Parseval). Raises `InputError` for cubes that have no such spectrum.
+    """
+    check_stokes(stokes)
+    order, grid_hz, here = _grid(cube, infill is not None)
+    freq = float((grid_hz[0] + grid_hz[-1]) / 2)
+    z, distance = comoving(freq, redshift, cosmology)
+    depth = line_of_sight(z, cosmology)
+    ny, nx = cube.data.shape[2:]
+    cubes = [cube] if cross is None else [cube, _same_grid(cube, cross)]
+    masks = [_mask(c, stokes, order, infill is not None) for c in cubes]
+    has, seen = (np.logical_and.reduce([m[k] for m in masks]) for k in (0, 1))
+    here = here.copy()
+    here[here] = seen
+    window = has * np.multiply.outer(taper_of(ny, taper_space), taper_of(nx, taper_space))
+    if not window.any():
+        raise InputError(f"{stokes} has no data: every pixel is NaN in some channel, or where the taper is not 0")
+    if not has.all():
+        text = f"{1 - has.mean():.2g} of the lines of sight hold NaN and count as zero: rims of holes scatter power"
+        warnings.warn(text, InstrumentWarning, stacklevel=4)
+    v, u = np.fft.fftfreq(ny, cube.pixel_rad), np.fft.fftfreq(nx, cube.pixel_rad)
+    half = stokes != "P"  # of a real image half the plane is made
+    low, high = uv_limits(uv_range)
+    columns = np.flatnonzero(np.abs(u[: nx // 2 + 1] if half else u) <= high)
+    uv = np.hypot(v[:, None], u[columns])
+    times = np.broadcast_to((_both_signs(nx) if half else np.ones(nx))[columns], uv.shape)
+    (use,) = np.nonzero(((uv >= low) & (uv <= high)).ravel())
+    if not use.size:
+        raise InputError(f"uv_range = {uv_range} holds no cell of an image of {nx} x {ny}")
+    left_out: dict[str, int] = {}
+    along = taper_of(len(grid_hz), taper)
+    spectra, response = [], None
+    if psf_corrected:
+        response = _response(cube, order[seen], columns, use)
+        strong = response.min(axis=0) >= WEAK * response.max()
+        left_out["cells where the PSF is weak"] = int((~strong).sum())
+        use, response = use[strong], response[:, strong]
+    for c in cubes:
+        found = _transform(c, stokes, order[seen], window, has, columns, use)
+        if response is not None:
+            found /= response
+        if not here.all():
+            some, found = found, np.empty((len(grid_hz), use.size), complex)
+            found[here], found[~here] = some, _infill(grid_hz, here, float(to_si(infill, "s", "infill"))) @ some
+        spectra.append(found)
+    n = len(grid_hz)
+    square = float((window**2).mean() * (along**2).mean())
+    # V / N^2 = cell / N: the volume of a voxel over their number
+    scale = (distance * cube.pixel_rad) ** 2 * depth * (grid_hz[1] - grid_hz[0]) / (n * ny * nx * square)
+    folds = _both_signs(n)
+    power, auto = _delays(spectra, along, folds, scale)
+    alike = square**2 / float((window**4).mean() * (along**4).mean())
+    frame = Frame(
+        cube.unit, stokes, freq, z, distance, depth, taper, taper_space, uv_range and (low, high),
+        1 - float(has.mean()), int((~here).sum()), psf_corrected,
+    )  # fmt: skip
+    k_par = 2 * np.pi * np.arange(len(folds)) / (n * (grid_hz[1] - grid_hz[0]) * depth)
+    rising = np.argsort(uv.ravel()[use], kind="stable")
+    same = auto is power
+    power = np.take(power, rising, axis=1)
+    auto = power if same else np.take(auto, rising, axis=1)
+    use = use[rising]
+    k_perp = uv.ravel()[use] * 2 * np.pi / distance
+    modes = alike * (0.5 if half else 1.0)
+    return Cells(frame, k_perp, k_par, power, auto, times.ravel()[use], folds, modes, left_out)
+
+
+def _both_signs(n: int) -> Float:
+    """How many of n cells each of the n // 2 + 1 from 0 to Nyquist stands for (both signs)."""
+    times = np.full(n // 2 + 1, 2.0)
+    times[[0] if n % 2 else [0, -1]] = 1
+    return times
+
+
+def _grid(cube: StokesCube, infill: bool) -> tuple[Int, Float, Bool]:
+    """Channels in growing order, the even grid of frequencies they lie on, and where it has a channel."""
+    order = np.argsort(cube.freq_hz, kind="stable")
+    freq = cube.freq_hz[order]
+    if len(freq) < 2:
+        raise InputError("one channel has no k_par: use spectrum_2d, or give a cube of two channels or more")
+    steps = np.diff(freq)
+    step = float(steps.min())
+    if step <= 0:
+        twice = freq[:-1][steps <= 0][0] / 1e6
+        raise InputError(f"two channels at {twice:.6g} MHz: power along the line of sight needs each one once")
+    number = np.round((freq - freq[0]) / step).astype(int)
+    # the finest step may be off by rounding of the file: the whole span is the better ruler
+    step = float((freq[-1] - freq[0]) / number[-1])
+    off = np.abs(freq - freq[0] - number * step).max() / step
+    if off > 0.01:
+        raise InputError(f"channels are not evenly spaced (off by {off:.2g} of a channel): regrid them first")
+    if number[-1] + 1 > len(freq) and not infill:
+        gap = int(np.argmax(np.diff(number)))
+        raise InputError(
+            f"{number[-1] + 1 - len(freq)} channels are missing, the first between {freq[gap] / 1e6:.6g} and "
+            f"{freq[gap + 1] / 1e6:.6g} MHz: fill them in with infill=300 * u.ns, or take a part without gaps"
+        )
+    grid = freq[0] + step * np.arange(number[-1] + 1)
+    return order, grid, np.isin(np.arange(len(grid)), number)
+
+
+def _same_grid(cube: StokesCube, other: StokesCube) -> StokesCube:
+    same = cube.data.shape == other.data.shape and cube.unit == other.unit
+    same = same and np.allclose(cube.freq_hz, other.freq_hz, rtol=1e-9, atol=0)
+    if not same or not np.isclose(cube.pixel_rad, other.pixel_rad, rtol=1e-9, atol=0):
+        raise InputError("cross needs a cube of the same shape, channels, pixel and unit")
+    return other
+
+
+def _planes(cube: StokesCube, stokes: str, channels: Int) -> Float | Complex:
+    """Images of some channels in double precision (C, Ny, Nx); complex for "P"."""
+    if stokes == "P":
+        out = np.empty((len(channels), *cube.data.shape[2:]), complex)
+        out.real, out.imag = cube.data[channels, 1], cube.data[channels, 2]
+        return out
+    return np.asarray(cube.data[channels, "IQUV".index(stokes)], float)
+
+
+def _mask(cube: StokesCube, stokes: str, order: Int, infill: bool) -> tuple[Bool, Bool]:
+    """Pixels with data in every channel that has any (Ny, Nx), and those channels, in order (F,)."""
+    has = np.ones(cube.data.shape[2:], bool)
+    seen = np.ones(len(order), bool)
+    for k, channel in enumerate(order):
+        # the sum of an image is finite unless a voxel is not: most channels are read once only
+        image = _planes(cube, stokes, order[k : k + 1])[0]
+        if np.isfinite(image.sum()):
+            continue
+        if np.isinf(image).any():
+            raise InputError(
+                f"{stokes} of channel {channel} has {np.isinf(image).sum()} infinite pixels: make them NaN"
+            )
+        good = ~np.isnan(image)
+        seen[k] = good.any()
+        has &= good | ~seen[k]
+    if not seen.any():
+        raise InputError(f"{stokes} has no data: all NaN")
+    if not seen.all() and not infill:
+        where = ", ".join(str(c) for c in order[~seen][:5]) + (", ..." if (~seen).sum() > 5 else "")
+        raise InputError(
+            f"{(~seen).sum()} channels are all NaN ({where}): fill them in with infill=300 * u.ns, or leave them out"
+        )
+    return has, seen
+
+
+def _transform(
+    cube: StokesCube, stokes: str, channels: Int, window: Float, has: Bool, columns: Int, use: Int
+) -> Complex:
+    """Cells `use` among columns of the DFT of each image behind the window, the mean of the cube taken off (C, N)."""
+    whole = has.all()
+    means = []
+    for a in range(0, len(channels), BLOCK):
+        part = _planes(cube, stokes, channels[a : a + BLOCK])
+        means.append((part if whole else part[:, has]).reshape(len(part), -1).mean(axis=1))
+    mean = np.concatenate(means).mean()
+    out = np.empty((len(channels), use.size), complex)
+    for a in range(0, len(channels), BLOCK):
+        part = _planes(cube, stokes, channels[a : a + BLOCK]) - mean
+        if not (window == 1).all():
+            part *= window
+        if not whole:
+            part[:, ~has] = 0.0  # 0 times NaN is NaN
+        into = out[a : a + BLOCK]
+        if use.size == len(window) * len(columns):
+            _columns_of(part, columns, into.reshape(len(part), len(window), -1))
+        else:
+            np.take(_columns_of(part, columns).reshape(len(part), -1), use, axis=1, out=into, mode="clip")
+    return out
+
+
+def _columns_of(images: Float | Complex, columns: Int, out: Complex | None = None) -> Complex:
+    """Some columns of the DFT over the last two axes (..., Ny, C): rows first, then only what is asked for."""
+    from ducc0 import fft
+
+    rows = fft.c2c if np.iscomplexobj(images) else fft.r2c
+    first: Any = rows(images, axes=(images.ndim - 1,), nthreads=0)
+    if len(columns) < first.shape[-1]:
+        first = first[..., columns]
+    return np.asarray(fft.c2c(first, axes=(images.ndim - 2,), out=first if out is None else out, nthreads=0))
+
+
+def _delays(spectra: list[Complex], along: Float, folds: Float, scale: float) -> tuple[Float, Float]:
+    """Power of delays 0 to Nyquist (M, N), mean over both signs, across and by itself."""
+    from ducc0 import fft
+
+    n, m, size = len(along), len(folds), spectra[0].shape[1]
+    power = np.empty((m, size))
+    auto = power if len(spectra) == 1 else np.empty((m, size))
+    for a in range(0, size, 4096):
+        parts = [
+            fft.c2c(s[:, a : a + 4096] * along[:, None], axes=(0,), nthreads=0, out=None)  # (n, cells)
+            for s in spectra
+        ]
+        squares = [p.real**2 + p.imag**2 for p in parts]
+        power[:, a : a + 4096] = _folded(_across(parts) if len(parts) == 2 else squares[0], n, m) * scale
+        if len(parts) == 2:
+            auto[:, a : a + 4096] = np.sqrt(_folded(squares[0], n, m) * _folded(squares[1], n, m)) * scale
+    return power, auto
+
+
+def _across(parts: list[Complex]) -> Float:
+    one, two = parts
+    return one.real * two.real + one.imag * two.imag
+
+
+def _folded(square: Float, n: int, m: int) -> Float:
+    """Mean of delays +k and -k, k = 0 to Nyquist."""
+    out = square[:m].copy()
+    inner = slice(1, (n - 1) // 2 + 1)
+    out[inner] = (out[inner] + square[: n // 2 : -1]) / 2
+    return out
+
+
+def _infill(freq_hz: Float, here: Bool, delay_s: float) -> Float:
+    """Operator (missing, there): the likeliest values of a spectrum of delays below `delay_s`, 1e6 times the noise.
+
+    Wiener interpolation with the covariance sinc(2 delay (f - f')) of power that is even out to that delay.
+    """
+    if not delay_s > 0:
+        raise InputError(f"infill = {delay_s} s must be above 0: the largest delay to fill in, such as 300 * u.ns")
+    kernel = np.sinc(2 * delay_s * (freq_hz[:, None] - freq_hz))
+    there = kernel[np.ix_(here, here)] + 1e-12 * np.eye(int(here.sum()))
+    return np.asarray(np.linalg.lstsq(there, kernel[np.ix_(here, ~here)], rcond=1e-13)[0].T)
+
+
+def _response(cube: StokesCube, channels: Int, columns: Int, use: Int) -> Float:
+    """What the PSF makes of each cell, |DFT(PSF)| pixel² / solid angle (C, N); 1 at 0 for a Gaussian PSF."""
+    if cube.psf is None or cube.psf.data is None:
+        raise InputError("psf_corrected needs the images of the PSF: give a cube that an Imager has made")
+    out = np.empty((len(channels), use.size))
+    for k, channel in enumerate(channels):
+        psf = np.asarray(cube.psf.data[channel], complex)
+        if psf.shape != cube.data.shape[2:] or not np.isfinite(psf).all():
+            raise InputError(f"the PSF of channel {channel} is {psf.shape} or not finite: it must be like the image")
+        out[k] = np.abs(_columns_of(psf, columns)).ravel()[use] * cube.pixel_rad**2 / cube.psf.solid_angle_sr[channel]
+    return out
