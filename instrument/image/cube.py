@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from instrument.whole_file import whole_file
 
 BOLTZMANN = 1.380649e-23  # J/K
 JY = 1e-26  # W m^-2 Hz^-1
-Unit = Literal["Jy/beam", "K"]
+Unit = Literal["Jy/beam", "Jy/pixel", "K"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,14 +23,38 @@ class Psf:
     """Point spread function (F, Ny, Nx), peak 1 at the centre pixel, and the Gaussian fitted to its main lobe.
 
     `major_rad`, `minor_rad` are full widths at half maximum, `angle_rad` is the position angle of the major axis, north
-    through east, (F,) each; `residual` is the largest difference between lobe and Gaussian above half maximum.
+    through east, (F,) each; `residual` is the largest difference between lobe and Gaussian above half maximum. `data`
+    is None where only the widths are known, as in a FITS file.
     """
 
-    data: Float
+    data: Float | None
     major_rad: Float
     minor_rad: Float
     angle_rad: Float
     residual: Float
+
+    @classmethod
+    def gaussian(cls, major: Any, minor: Any = None, angle: Any = None) -> Psf:
+        """A Gaussian beam known by its widths alone: full widths at half maximum and position angle, one or (F,) each.
+
+        Quantities; `minor` is `major` unless given, `angle` (of the major axis, north through east) is 0.
+        """
+        widths = (to_si(major, "rad", "major"), to_si(major if minor is None else minor, "rad", "minor"))
+        turned = 0.0 if angle is None else to_si(angle, "rad", "angle")
+        a, b, pa = np.broadcast_arrays(*(np.atleast_1d(np.asarray(x, float)) for x in (*widths, turned)))
+        return cls(None, a, b, pa, np.zeros(len(a)))
+
+    def of(self, channels: int) -> Psf:
+        """The same for so many channels: one beam becomes that of all; raises `InputError` for any other number."""
+        given = {len(x) for x in (self.major_rad, self.minor_rad, self.angle_rad, self.residual)}
+        given |= set() if self.data is None else {len(self.data)}
+        if given == {channels}:
+            return self
+        if given != {1}:
+            raise InputError(f"the PSF has {' and '.join(map(str, sorted(given)))} channels, the cube {channels}")
+        data = None if self.data is None else np.broadcast_to(self.data, (channels, *self.data.shape[1:]))
+        four = (self.major_rad, self.minor_rad, self.angle_rad, self.residual)
+        return Psf(data, *(np.repeat(x, channels) for x in four))
 
     @property
     def solid_angle_sr(self) -> Float:
@@ -43,7 +67,7 @@ class StokesCube:
     """Stokes I, Q, U, V images, real (F, 4, Ny, Nx); x runs to the west, y to the north; NaN is no data.
 
     `StokesCube(data=array, frequencies=freqs, pixel=0.5 * u.arcmin, unit="K")` makes one from anywhere. The centre is
-    pixel (Ny // 2, Nx // 2).
+    pixel (Ny // 2, Nx // 2). Channels stay in the order given; `sorted()` puts them in order of frequency.
     """
 
     data: Float
@@ -69,18 +93,27 @@ class StokesCube:
         freq = np.atleast_1d(np.asarray(to_si(frequencies, "Hz", "frequencies"), float))
         if len(freq) != len(cube):
             raise InputError(f"{len(cube)} channels but {len(freq)} frequencies")
-        if unit not in ("Jy/beam", "K"):
-            raise InputError(f"unit = '{unit}' is not one of 'Jy/beam', 'K'")
+        if (wrong := ~(np.isfinite(freq) & (freq > 0))).any():
+            raise InputError(f"frequencies of {listing(wrong)} are {show(freq[wrong])} Hz: needed finite and above 0")
+        step = float(to_si(pixel, "rad", "pixel"))
+        if not 0 < step < np.inf:
+            raise InputError(f"pixel = {pixel} is not finite and above 0")
+        if unit not in get_args(Unit):
+            raise InputError(f"unit = {unit!r} is not one of {', '.join(map(repr, get_args(Unit)))}: say which it is")
         put(self, "data", cube)
         put(self, "freq_hz", freq)
-        put(self, "pixel_rad", float(to_si(pixel, "rad", "pixel")))
+        put(self, "pixel_rad", step)
         put(self, "unit", unit)
         put(self, "centre", centre)
-        put(self, "psf", psf)
+        put(self, "psf", psf and psf.of(len(cube)))
 
     @property
     def wcs(self) -> Any:
-        """World coordinates of the axes (x, y, Stokes, frequency), SIN projection about the centre."""
+        """World coordinates of the axes (x, y, Stokes, frequency), SIN projection about the centre.
+
+        The frequency axis is even, with the mean step; uneven or unsorted channels are in `freq_hz`. A centre that is
+        not known is at 0, 0.
+        """
         from astropy.wcs import WCS
 
         out = WCS(naxis=4)
@@ -88,7 +121,8 @@ class StokesCube:
         out.wcs.ctype = ["RA---SIN", "DEC--SIN", "STOKES", "FREQ"]
         out.wcs.cunit = ["deg", "deg", "", "Hz"]
         step = np.rad2deg(self.pixel_rad)
-        spacing = float(np.diff(self.freq_hz).mean()) if len(self.freq_hz) > 1 else 1.0
+        # 1 Hz where there is no spacing: an axis of step 0 has no coordinates
+        spacing = (float(np.diff(self.freq_hz).mean()) if len(self.freq_hz) > 1 else 0.0) or 1.0
         out.wcs.cdelt = [-step, step, 1.0, spacing]
         out.wcs.crpix = [nx // 2 + 1, ny // 2 + 1, 1, 1]
         centre = self.centre or Direction(0.0, 0.0)
@@ -97,44 +131,96 @@ class StokesCube:
         return out
 
     def to_kelvin(self) -> StokesCube:
-        """The same in K, Rayleigh-Jeans, with the solid angle of each channel's PSF; raises without a PSF."""
+        """The same in K, Rayleigh-Jeans: c² / (2 k nu² Omega), the solid angle of each channel's PSF, or of a pixel.
+
+        Raises `InputError` without a PSF and where a channel that has data has none: a width of 0 or NaN.
+        """
         if self.unit == "K":
             return self
-        if self.psf is None:
-            raise InputError("a cube in Jy/beam needs its PSF to become K: the solid angle of the beam is not known")
-        factor = JY * LIGHT**2 / (2 * BOLTZMANN * self.freq_hz**2 * self.psf.solid_angle_sr)
-        return self._with(data=self.data * factor[:, None, None, None], unit="K")
+        if self.unit == "Jy/beam" and self.psf is None:
+            raise InputError(
+                "a cube in Jy/beam needs its PSF to become K: give psf=Psf.gaussian(major, minor, angle), its widths"
+            )
+        omega = self.psf.solid_angle_sr if self.psf and self.unit == "Jy/beam" else self.pixel_rad**2
+        omega = np.broadcast_to(omega, len(self.data))
+        usable = np.isfinite(omega) & (omega > 0)
+        wrong = np.array([not ok and not np.isnan(x).all() for ok, x in zip(usable, self.data, strict=True)])
+        if wrong.any():
+            raise InputError(
+                f"the solid angle of the PSF in {listing(wrong)} is {show(omega[wrong])} sr: it has no K; "
+                "leave these channels out, or give psf=Psf.gaussian(major, minor, angle)"
+            )
+        factor = JY * LIGHT**2 / (2 * BOLTZMANN * self.freq_hz**2 * np.where(usable, omega, np.nan))
+        exact = np.result_type(self.data, np.float32)  # a float32 cube stays one
+        return self._with(data=self.data * factor[:, None, None, None].astype(exact), unit="K")
+
+    def channels(self, keep: Any) -> StokesCube:
+        """Some of the channels: indices in the order wanted, a slice, or (F,) booleans."""
+        index = np.atleast_1d(np.arange(len(self.data))[keep])
+        psf = self.psf and Psf(
+            None if self.psf.data is None else self.psf.data[index],
+            *(x[index] for x in (self.psf.major_rad, self.psf.minor_rad, self.psf.angle_rad, self.psf.residual)),
+        )
+        return self._with(data=self.data[index], freq_hz=self.freq_hz[index], psf=psf)
+
+    def sorted(self) -> StokesCube:
+        """The channels in order of frequency, low to high; the cube itself where they are."""
+        ascending = bool((np.diff(self.freq_hz) >= 0).all())
+        return self if ascending else self.channels(np.argsort(self.freq_hz, kind="stable"))
+
+    def with_data(self, data: Any) -> StokesCube:
+        """The same axes, unit, centre and PSF with other data (F, 4, Ny, Nx)."""
+        if np.shape(data) != self.data.shape:
+            raise InputError(f"data has shape {np.shape(data)}, needed that of the cube, {self.data.shape}")
+        return self._with(data=data)
 
     def _with(self, **changes: Any) -> StokesCube:
         from astropy import units as u
 
         given = {"data": self.data, "unit": self.unit, "centre": self.centre, "psf": self.psf, **changes}
-        return StokesCube(frequencies=self.freq_hz * u.Hz, pixel=self.pixel_rad * u.rad, **given)
+        freq = given.pop("freq_hz", self.freq_hz)
+        return StokesCube(frequencies=freq * u.Hz, pixel=self.pixel_rad * u.rad, **given)
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write a FITS cube (Stokes and frequency axes, IAU polarization, restoring beam); replaces nothing half."""
+        """Write a FITS cube in float32 (Stokes and frequency axes, IAU polarization, restoring beam), whole or not.
+
+        Beams of many channels, and frequencies that are not even, are in a table BEAMS; `read_cube` reads both back.
+        """
         from astropy.io import fits
 
-        uneven = len(self.freq_hz) > 2 and np.ptp(np.diff(self.freq_hz)) > 1e-6 * abs(np.diff(self.freq_hz)[0])
+        wcs = self.wcs.wcs
+        even = wcs.crval[3] + wcs.cdelt[3] * np.arange(len(self.freq_hz))
         header = self.wcs.to_header()
+        for name, values in (("CRVAL", wcs.crval), ("CDELT", wcs.cdelt)):  # all digits: astropy writes twelve
+            header.update({f"{name}{i + 1}": float(value) for i, value in enumerate(values)})
         header["BUNIT"] = self.unit
         header["POLCCONV"] = ("IAU", "U and V: x north, y east, V right-handed")
         header["ORIGIN"] = "instrument"
+        if self.centre is None:
+            header["NOCENTRE"] = (True, "the centre is not known: 0, 0 stands for it")
         hdus = [fits.PrimaryHDU(np.asarray(self.data, np.float32), header=header)]
         known: Any = [] if self.psf is None else np.flatnonzero(np.isfinite(self.psf.major_rad))
         if self.psf is not None and len(known):  # FITS has no NaN in a header: the first channel with a beam
             beam, first = hdus[0].header, known[0]
             beam["BMAJ"], beam["BMIN"] = np.rad2deg(self.psf.major_rad[first]), np.rad2deg(self.psf.minor_rad[first])
             beam["BPA"] = np.rad2deg(self.psf.angle_rad[first])
-        if uneven or (self.psf is not None and len(self.freq_hz) > 1):
+        if len(self.freq_hz) > 1 and (self.psf is not None or not np.allclose(self.freq_hz, even, rtol=1e-12, atol=0)):
             columns = [fits.Column("FREQ", "D", "Hz", array=self.freq_hz)]
             if self.psf is not None:
-                for name, values in (
-                    ("BMAJ", self.psf.major_rad),
-                    ("BMIN", self.psf.minor_rad),
-                    ("BPA", self.psf.angle_rad),
-                ):
-                    columns.append(fits.Column(name, "D", "deg", array=np.rad2deg(values)))
+                widths = {"BMAJ": self.psf.major_rad, "BMIN": self.psf.minor_rad, "BPA": self.psf.angle_rad}
+                columns += [fits.Column(name, "D", "deg", array=np.rad2deg(x)) for name, x in widths.items()]
             hdus.append(fits.BinTableHDU.from_columns(columns, name="BEAMS"))
         with whole_file(path) as partial:
             fits.HDUList(hdus).writeto(partial, overwrite=True)
+
+
+def listing(wrong: Any) -> str:
+    """Channels that are wrong (F,) in words: "channels 0, 3, 4 and 12 more"."""
+    which = np.flatnonzero(wrong).tolist()
+    more = f" and {len(which) - 4} more" if len(which) > 4 else ""
+    return f"channel{'s' if len(which) > 1 else ''} {', '.join(map(str, which[:4]))}{more}"
+
+
+def show(values: Any) -> str:
+    """Up to four of some values."""
+    return ", ".join(f"{v:.6g}" for v in np.asarray(values)[:4]) + (", ..." if len(values) > 4 else "")

@@ -68,10 +68,11 @@ def stokes_images(cube: StokesCube, channel: int = 0) -> Figure:
 def psf_image(cube: StokesCube, channel: int = 0, ax: Axes | None = None) -> Axes:
     """Central part of the PSF (Ny, Nx) of one channel, with the fitted Gaussian and the PSF itself at half maximum.
 
-    Colours are linear up to 0.01 of the peak and logarithmic beyond. Raises `InputError` for a cube without a PSF.
+    Colours are linear up to 0.01 of the peak and logarithmic beyond. Raises `InputError` for a cube without a PSF, or
+    whose PSF is known by its widths alone.
     """
-    if cube.psf is None:
-        raise InputError("this cube has no PSF to draw")
+    if cube.psf is None or cube.psf.data is None:
+        raise InputError(f"this cube has no {'PSF' if cube.psf is None else 'image of the PSF'} to draw")
     ax = axes_of(ax, (6.4, 6.0))
     data, pixel = np.asarray(cube.psf.data[channel], float), 60 * np.rad2deg(cube.pixel_rad)
     ny, nx = data.shape
