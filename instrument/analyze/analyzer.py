@@ -8,7 +8,8 @@ from typing import Any
 
 from instrument.analyze.cells import Cells, cells_of
 from instrument.analyze.cylinders import Cylindrical, Spherical, cylindrical, spherical
-from instrument.analyze.faraday import FaradayCube, Precision, rm_synthesis
+from instrument.analyze.faraday import Precision, rm_synthesis
+from instrument.analyze.faraday_cube import FaradayCube
 from instrument.analyze.fourier import Stokes, Taper
 from instrument.analyze.leakage import Leakage, leakage_of
 from instrument.analyze.photometry import ForcedPhotometry, SourceFluxes
@@ -174,6 +175,7 @@ class Analyzer:
         uv_range: tuple[float, float] | None = None,
         bins: Any = 10,
         bins_par: Any = 10,
+        infill: Any = None,
         redshift: float | None = None,
         cosmology: Any = None,
     ) -> EoRWindow:
@@ -184,7 +186,9 @@ class Analyzer:
         """
 
         def spectrum(cube: StokesCube) -> Cylindrical:
-            made = Analyzer(cube).cells(stokes, taper, taper_space, uv_range, redshift=redshift, cosmology=cosmology)
+            made = Analyzer(cube).cells(
+                stokes, taper, taper_space, uv_range, infill=infill, redshift=redshift, cosmology=cosmology
+            )
             return made.cylindrical(bins, bins_par)
 
         if self.cube is None:
@@ -206,15 +210,15 @@ class Analyzer:
     ) -> FaradayCube:
         """Faraday dispersion function at `depths` in rad/m², bare or a `Quantity`, in any order; see `FaradayCube`.
 
-        "P" is Q + iU; of a real Stokes parameter F(-phi) is the conjugate of F(phi). `weights` (F,), such as
-        1 / sigma²; a channel of weight 0 or without data counts nowhere, lambda²_0 included; a voxel that is NaN is left
-        out of the sums of its pixel. `lambda2_0` in m² is the weighted mean of lambda²; 0 makes phases those of the
-        emission. `spectral_index` a divides by (nu/nu0)^a; `divide_by_i` divides each voxel by Stokes I (I <= 0 or
-        not finite: left out) and multiplies F with I at nu0, of the power law fitted to I of the pixel; nu0 is the
-        frequency of the mean lambda². `noise`, sigma of Q and U in the unit of the cube, one or (F,), becomes that of F.
-        `precision` "single" or "double" is that of the cube; single is good to 4e-7 of the largest |F|. `out` names a
-        .npy file for F, which is then mapped: memory does not grow with it. `progress` is called with the fraction done.
-        Raises `InputError` for infinite values, for a cube without data, and for depths that are not numbers.
+        "P" is Q + iU; of a real Stokes parameter F(-phi) is the conjugate of F(phi). `weights` (F,) are such as
+        1 / sigma²; a channel of weight 0 or without data counts nowhere, lambda²_0 included; a voxel that is NaN is
+        left out of the sums of its pixel. `lambda2_0` in m² is the weighted mean of lambda²; with 0 the phases are
+        those of the emission. `spectral_index` a divides by (nu/nu0)^a; `divide_by_i` divides each voxel by Stokes I
+        (I <= 0 or not finite: left out) and multiplies F with I at nu0, of the power law fitted to I of the pixel; nu0
+        is the frequency of the mean lambda². `noise`, sigma of Q and of U in the unit of the cube, one number or (F,),
+        becomes that of F. `precision` "single" or "double" is that of the cube; single is good to 4e-7 of the largest
+        |F|. `out` names a .npy file for F, which is then mapped: memory does not grow with it. `progress` is called
+        with the fraction done. Raises `InputError` for infinite values and for a cube without data.
         """
         if self.cube is None:
             raise InputError("rm_synthesis needs a cube: Analyzer(cube)")
