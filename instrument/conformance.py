@@ -2,7 +2,8 @@
 
 `check(obj)` returns a `Report`, one line per claim. A claim is a function whose name is the sentence it checks: it
 returns a remark (what was measured) and raises when it does not hold. The claims of Jones terms are in
-`conformance_terms`, those of engines in `conformance_engines`; what they are evaluated on is in `conformance_bench`.
+`conformance_terms`, those of engines in `conformance_engines`, those of foreground removers in
+`conformance_foregrounds`; what they are evaluated on is in `conformance_bench`.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from instrument import conformance_engines, conformance_terms, mat2
+from instrument import conformance_engines, conformance_foregrounds, conformance_terms, mat2
 from instrument.component import Component
 from instrument.conformance_bench import (
     Broken,
@@ -28,6 +29,7 @@ from instrument.conformance_bench import (
     problems,
 )
 from instrument.errors import InputError, InstrumentError, InstrumentWarning
+from instrument.foreground import ForegroundRemover
 from instrument.jones.base import JonesTerm
 from instrument.model import Instrument
 from instrument.observe.sampling import Sampling
@@ -73,7 +75,7 @@ class Report:
 
 
 def check(obj: object, at: Sampling | None = None) -> Report:
-    """Check a Jones term, an instrument, a sky or an engine against the contract of its kind.
+    """Check a Jones term, an instrument, a sky, an engine or a foreground remover against the contract of its kind.
 
     `at` is where a term is evaluated and where a sky is placed, for those that fit one array only (tables per station);
     a small array of LOFAR-like stations otherwise. Raises `InputError` where there is no contract for such an object.
@@ -286,9 +288,16 @@ def _engine(engine: Predictor, at: Sampling | None) -> Iterator[Line]:
         yield _line(claim, engine, list(served.values())[-1])
 
 
+def _remover(remover: ForegroundRemover, at: Sampling | None) -> Iterator[Line]:
+    yield _line(a_round_trip_through_json_gives_an_equal_object, remover, ForegroundRemover)
+    for claim in conformance_foregrounds.CLAIMS:
+        yield _line(claim, remover)
+
+
 CONTRACTS: dict[type[Component], Callable[[Any, Sampling | None], Iterator[Line]]] = {
     JonesTerm: _term,
     Instrument: _instrument,
     Sky: _sky,
     Predictor: _engine,
+    ForegroundRemover: _remover,
 }

@@ -1,0 +1,36 @@
+"""Faraday rotation as a foreground: the spectra that leaked polarization of moderate Faraday depth can have."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BeforeValidator, Field
+
+from instrument.errors import Outcome
+from instrument.foreground import ForegroundRemover, Separation
+from instrument.foreground_linear import leading, projection
+from instrument.observe.directions import LIGHT
+from instrument.units import Float, to_si
+
+Depth = Annotated[float, BeforeValidator(lambda x: to_si(x, "rad/m2", "depth") if hasattr(x, "unit") else x)]
+
+
+class FaradayFilter(ForegroundRemover):
+    """Projects out exp(+-2i phi lambda^2) for all |phi| below `depth` (rad/m^2): F_I(phi) around 0.
+
+    The modes are the eigenvectors of the covariance of a spectrum that is even over those depths, sin(x)/x of
+    x = 2 depth (lambda^2 - lambda'^2), above `keep` of the largest eigenvalue.
+    """
+
+    depth: Annotated[Depth, Field(ge=0, allow_inf_nan=False)] = 3.0
+    keep: Annotated[float, Field(gt=0, lt=1)] = 1e-9
+
+    def separate(self, maps: Any, freq_hz: Float) -> Separation:
+        """Foreground V V^T X."""
+        lambda2 = (LIGHT / freq_hz) ** 2
+        kernel = np.sinc(2 * self.depth / np.pi * (lambda2[:, None] - lambda2))
+        values, vectors = leading(kernel, len(kernel))
+        n = int((values > self.keep * values[0]).sum())
+        remark = f"{n} modes of Faraday depths within {self.depth:g} rad/m^2"
+        return projection(maps, vectors[:, :n], Outcome.CONVERGED, remark, adapted=False)
