@@ -55,17 +55,49 @@ def parser() -> argparse.ArgumentParser:
     run.add_argument("--out", metavar="DIR", help="folder to write (default: runs/NAME); must not exist or be empty")
     run.add_argument("--no-verify", action="store_true", help="leave out the check against the direct sum")
     scene_verb("plan", "Say what would be done, left out, and at what cost; nothing is computed.")
+    _add_analyze(verbs)
     verbs.add_parser("scenes", help="List the shipped scenes.")
     verbs.add_parser("plugins", help="List the plugins, and what is broken.")
     verbs.add_parser("doctor", help="Check this installation: versions, tables, threads, memory, a self-test.")
     return top
 
 
+def _add_analyze(verbs: Any) -> None:
+    text = "Faraday depth, power spectra, foreground removal and EoR window of FITS cubes."
+    verb = verbs.add_parser("analyze", help=text, description=text)
+    verb.add_argument("files", metavar="CUBE.fits", nargs="+", help="FITS cubes, together or one for each Stokes")
+    verb.add_argument("--out", metavar="DIR", help="folder to write (default: runs/NAME); must not exist or be empty")
+    verb.add_argument(
+        "--products", metavar="A,B", help="faraday, spectrum-2d, cylindrical, spherical, window (default: all possible)"
+    )
+    verb.add_argument("--stokes", metavar="Q,U", help="what the planes of the files are, where they do not say it")
+    verb.add_argument("--unit", help="Jy/beam, Jy/pixel or K, where the files do not say it")
+    verb.add_argument(
+        "--beam", metavar="SIZE", help="beam where the files name none: '3 arcmin', or major, minor, angle"
+    )
+    verb.add_argument("--depths", metavar="A,B,STEP", help="Faraday depths in rad/m2 (default: -50,50,0.25)")
+    verb.add_argument("--uv-range", metavar="A,B", help="baselines of the spectra, wavelengths, e.g. 30,800")
+    verb.add_argument("--taper", help="along frequency: blackman-harris (default), blackman-harris-7, hann, none")
+    verb.add_argument("--taper-space", help="over the images: hann (default), blackman-harris, none")
+    verb.add_argument("--infill", metavar="DELAY", help="fill missing channels in from delays below it, e.g. '300 ns'")
+    verb.add_argument("--remove", metavar="NAME", help="foreground remover: gmca, pca, polynomial, ...")
+    verb.add_argument(
+        "--remover", action="append", default=[], metavar="KEY=VALUE", help="its setting, e.g. components=4"
+    )
+    verb.add_argument("--signal", metavar="MODEL", help="21-cm model of the window (default: 21cmFAST_2011_z9.50)")
+    verb.add_argument("--noise", metavar="NOISE.fits", help="cube of noise alone, added to the leakage in the window")
+    verb.add_argument(
+        "--wedge", metavar="ANGLE", help="from the phase centre: below its line no bin counts, e.g. '2 deg'"
+    )
+    verb.add_argument("--redshift", type=float, help="of the whole band (default: of its middle)")
+    verb.add_argument("--cubes", action="store_true", help="write the Faraday cube and the residual too")
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     warnings.showwarning = _show_warning  # type: ignore[assignment]
     try:
-        given = parser().parse_args(argv)
+        given = parser().parse_args(_joined(sys.argv[1:] if argv is None else argv))
         return int(VERBS[given.verb](given))
     except InputError as error:
         print(f"instrument: {_flat(error)}", file=sys.stderr)
@@ -78,6 +110,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         return FAILED
     except BrokenPipeError:
         return DONE
+
+
+def _joined(words: Sequence[str]) -> list[str]:
+    """The words with `--depths -50,50,1` as `--depths=-50,50,1`: a value that begins with a minus is no option."""
+    out: list[str] = []
+    for word in words:
+        if re.match(r"-[\d.]", word) and out and re.fullmatch(r"--[a-z-]+", out[-1]):
+            out[-1] += f"={word}"
+        else:
+            out.append(word)
+    return out
 
 
 def _flat(error: Exception) -> str:
@@ -117,6 +160,38 @@ def _run(given: argparse.Namespace) -> int:
     return DONE if result.passed else FELL_SHORT
 
 
+def _analyze(given: argparse.Namespace) -> int:
+    import shlex
+
+    from instrument.analyze_run import analyze_files
+    from instrument.cube_analysis import CubeAnalysis
+    from instrument.scene_file import override
+
+    def listed(name: str) -> Any:
+        text = getattr(given, name)
+        try:
+            return None if text is None else tuple(float(part) for part in text.split(","))
+        except ValueError:
+            raise InputError(f"--{name.replace('_', '-')} {text}: numbers with commas between, please") from None
+
+    fields: dict[str, Any] = {
+        "products": None if given.products is None else tuple(p.strip() for p in given.products.split(",")),
+        "depths": listed("depths"),
+        "uv_range": listed("uv_range"),
+        **{name: getattr(given, name) for name in ("infill", "remove", "signal", "wedge", "redshift")},
+    }
+    fields = {name: value for name, value in fields.items() if value is not None}
+    for name in ("taper", "taper_space"):
+        if (text := getattr(given, name)) is not None:
+            fields[name] = None if text == "none" else text
+    settings = CubeAnalysis(remover=override({}, given.remover), cubes=given.cubes, **fields)
+    words = ["instrument", *sys.argv[1:]]
+    result = analyze_files(
+        given.files, settings, given.out, given.stokes, given.unit, given.beam, given.noise, shlex.join(words), print
+    )
+    return DONE if result.passed else FELL_SHORT
+
+
 def _plan(given: argparse.Namespace) -> int:
     _, scene_file = _scene_file(given)
     plan = scene_file.plan(scene_file.scene(), given.memory, given.workers)
@@ -152,7 +227,7 @@ def _doctor(given: argparse.Namespace) -> int:
     return DONE if doctor(print) else FAILED
 
 
-VERBS = {"run": _run, "plan": _plan, "scenes": _scenes, "plugins": _plugins, "doctor": _doctor}
+VERBS = {"run": _run, "plan": _plan, "analyze": _analyze, "scenes": _scenes, "plugins": _plugins, "doctor": _doctor}
 
 
 if __name__ == "__main__":

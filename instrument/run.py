@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,6 +18,7 @@ from instrument.errors import InputError
 from instrument.observe.sampling import Sampling
 from instrument.plan import Plan
 from instrument.report.progress import progress_bar
+from instrument.run_folder import RunFolder
 from instrument.run_record import Result, json_ready, record, summary
 from instrument.scene_file import SEED_STEP, SceneFile, to_toml
 from instrument.units import Float
@@ -42,7 +41,7 @@ def run(
     `tables` are the TOML tables it was made from. Raises `InputError` before anything is computed or written when the
     scene or the folder will not do.
     """
-    folder = _folder(scene_file.name, out)
+    folder = RunFolder(scene_file.name, out)
     begin = time.perf_counter()
     scene = scene_file.scene()
     solved = scene_file.calibrator() is not None
@@ -50,54 +49,18 @@ def run(
     # a run that calibrates predicts the perfect instrument: its errors are put in block by block, and are the truth
     perfect = scene.with_fields(instrument=scene.instrument.with_fields(gain=None, feed=None)) if solved else scene
     plan = scene_file.plan(perfect, memory, workers)
-    result = Result(scene_file, scene.instrument, plan, folder, seconds={"plan": time.perf_counter() - begin})
+    result = Result(scene_file, scene.instrument, plan, folder.path, seconds={"plan": time.perf_counter() - begin})
     show(str(plan))
-    made = [p for p in folder.parents if not p.exists()]
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-        partial.chmod(0o755)
-    except OSError as error:
-        raise InputError(f"--out {folder}: {error.strerror}; choose another folder") from None
-    try:
+    with folder:
         _compute(result)
         if verify:
             with result.timed("verify"):
                 result.check = plan.verify(samples=64, seed=scene_file.seed)
         with result.timed("write"):
-            _write(result, tables, partial)
-        if out is None:
-            folder = result.folder = _folder(scene_file.name, out)  # another run may have taken the name meanwhile
-        if folder.exists():
-            folder.rmdir()
-        partial.rename(folder)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-        _remove_empty(made)
+            _write(result, tables, folder.partial)
+        result.folder = folder.finish()
     show(summary(result))
     return result
-
-
-def _folder(name: str, out: str | None) -> Path:
-    """The folder to write: the one asked for, which must be empty, or the next free one under runs/."""
-    if out is not None:
-        folder = Path(out).resolve() if Path(out).name in ("", "..") else Path(out)
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise InputError(f"--out {out}: it exists and is not an empty folder; choose another")
-        return folder
-    folder = Path("runs") / name
-    count = 1
-    while folder.exists():
-        count += 1
-        folder = Path("runs") / f"{name}-{count}"
-    return folder
-
-
-def _remove_empty(folders: list[Path]) -> None:
-    """Take away folders made for a run that left nothing in them."""
-    for folder in folders:
-        if folder.exists() and not any(folder.iterdir()):
-            folder.rmdir()
 
 
 def _compute(result: Result) -> None:
@@ -158,6 +121,9 @@ def _compute(result: Result) -> None:
                         stokes=stokes, uv_range=scene.image.uv_range, taper="hann"
                     )
                     result.spectra[stokes] = found_spectrum
+        if scene.analyze and scene.analyze.cube:
+            result.products = scene.analyze.cube.run(result.cube)
+            result.seconds |= result.products.seconds
     if stage is not None:
         with result.timed("calibrate"):
             result.calibration = stage.finish()
@@ -193,6 +159,8 @@ def _write(result: Result, tables: dict[str, Any], folder: Path) -> None:
         result.calibration.write(folder)
     if result.sweep is not None:
         result.sweep.write(folder)
+    if result.products is not None:
+        result.products.write(folder)
     for stokes, spectrum in result.spectra.items():
         spectrum.write(folder / f"spectrum_2d_{stokes}.ecsv")
     what = record(result, tables)
@@ -210,5 +178,6 @@ def _write(result: Result, tables: dict[str, Any], folder: Path) -> None:
         errors=solved.errors if solved else None,
         spectra=curves,
         sweep=result.sweep,
+        products=result.products,
     )
     (folder / "run.json").write_text(json.dumps(json_ready(what), indent=2, allow_nan=False), encoding="utf-8")

@@ -19,6 +19,7 @@ from instrument.analyze.spectra import Spectrum2D
 from instrument.analyze.subtraction import ManyDirectionsResult
 from instrument.analyze.sweep import Sweep
 from instrument.calibration_run import CalibrationResult
+from instrument.cube_analysis import CubeResults
 from instrument.doctor import package_version
 from instrument.errors import Outcome
 from instrument.image.cube import StokesCube
@@ -42,6 +43,7 @@ class Result:
     leakage: Leakage | None = None
     calibration: CalibrationResult | None = None
     spectra: dict[str, Spectrum2D] = field(default_factory=dict)
+    products: CubeResults | None = None
     sweep: Sweep | ManyDirectionsResult | None = None
     check: Check | None = None
     seconds: dict[str, float] = field(default_factory=dict)
@@ -53,6 +55,7 @@ class Result:
         solved = self.fluxes is None or all(o is Outcome.CONVERGED for o in self.fluxes.outcome)
         solved = solved and (self.calibration is None or self.calibration.passed)
         solved = solved and (self.sweep is None or self.sweep.passed)
+        solved = solved and (self.products is None or self.products.passed)
         return solved and (self.check is None or self.check.passed)
 
     @contextmanager
@@ -112,6 +115,11 @@ def record(result: Result, tables: dict[str, Any]) -> dict[str, Any]:
         }
     if result.sweep is not None:
         out["checks"]["solutions"] = {"outcome": [], "passed": result.sweep.passed}
+    if result.products is not None:
+        found = result.products.record()
+        out["checks"] |= found.pop("checks")
+        out["stage_errors"] |= found.pop("stage_errors")
+        out["cube"] = found
     if result.leakage is not None:
         out["leakage"] = {
             "inside_4_deg": result.leakage.inside(4.0),
@@ -176,6 +184,8 @@ def summary(result: Result) -> str:
         lines += ["", *result.calibration.summary()]
     if result.sweep is not None:
         lines += ["", *result.sweep.lines()]
+    if result.products is not None:
+        lines += ["", *result.products.lines_of_text(), ""]
     if result.fluxes is not None:
         bad = [o.value for o in result.fluxes.outcome if o is not Outcome.CONVERGED]
         lines += [f"photometry fell short: {text}" for text in bad]

@@ -20,6 +20,7 @@ from instrument.analyze.photometry import ForcedPhotometry
 from instrument.calibrate.directional import DirectionalCal
 from instrument.calibrate.selfcal import SelfCal
 from instrument.component import Component
+from instrument.cube_analysis import CubeAnalysis
 from instrument.errors import FileError, InputError, did_you_mean
 from instrument.image.dirty import Imager
 from instrument.jones.feed import FeedTerm
@@ -100,11 +101,12 @@ class CorrectTable(Component):
 
 
 class AnalyzeTable(Component):
-    """The table [analyze]: which products, and the settings of forced photometry."""
+    """The table [analyze]: products, settings of forced photometry, and [analyze.cube]: what is made of the images."""
 
     products: tuple[Literal["leakage", "spectrum-2d"], ...] = ("leakage",)
     uv_range: tuple[float, float] | None = None
     every: int = Field(default=1, ge=1)
+    cube: CubeAnalysis | None = None
 
     def photometry(self) -> ForcedPhotometry:
         """The photometry it asks for."""
@@ -135,6 +137,8 @@ class SceneFile(Component):
             raise InputError(f"name = {self.name!r} cannot name a folder")
         if self.analyze and "spectrum-2d" in self.analyze.products and self.image is None:
             raise InputError("[analyze] products = ['spectrum-2d'] needs images: give a table [image]")
+        if self.analyze and self.analyze.cube and self.image is None:
+            raise InputError("[analyze.cube] needs images: give a table [image]")
         if self.noise is not None and self.observation.frequency is None and self.observation.channel_width is None:
             raise InputError("[noise] needs the width of a channel: give channel_width in [observation]")
         return self

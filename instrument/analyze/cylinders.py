@@ -228,35 +228,40 @@ def spherical(cells: Cells, bins: Any = 15, log: bool = True, wedge: Any = None,
     # of every delay, the cells (u, v) that are above the wedge: the first so many
     ends = np.where(cells.k_par < least, 0, np.searchsorted(cells.k_perp * slope, cells.k_par, "right"))
     first = cells.k_perp[: np.searchsorted(cells.k_perp, 0.0, "right") + 1]
-    k = np.hypot(first, cells.k_par[ends > 0][:, None])
+    k = _length(first, cells.k_par[ends > 0][:, None])
     lowest = float(k[k > 0].min(initial=np.inf))
-    highest = float(np.hypot(cells.k_perp[-1], cells.k_par[-1]))
+    highest = float(_length(cells.k_perp[-1], cells.k_par[-1]))
     edges = bin_edges(lowest, highest, bins, log)
     shape = len(edges) - 1
     weight, sums, both, k_sum = (np.zeros(shape) for _ in range(4))
     bounds = np.zeros((len(cells.k_par), shape + 1), int)
-    total = in_wedge = 0.0
+    upto = np.append(0.0, np.cumsum(cells.times))  # whole numbers: differences are exact
+    in_wedge = 0.0
     for m, (k_par, fold, end) in enumerate(zip(cells.k_par, cells.folds, ends, strict=True)):
-        k = np.hypot(cells.k_perp, k_par)
+        k = _length(cells.k_perp, k_par)
         cut = _bounds(k, edges)
         if k_par == 0 and edges[0] == 0:
             cut = np.maximum(cut, np.searchsorted(k, 0.0, "right"))  # k = 0 is the mean
         bounds[m] = cut = np.minimum(cut, end)
-        weight += fold * cells.sums(cut, np.ones(len(k)))
+        weight += fold * np.diff(upto[cut])
         k_sum += fold * cells.sums(cut, k)
         found = cells.sums(cut, cells.power[m])
         sums += fold * found
         both += fold * (found if cells.auto is cells.power else cells.sums(cut, cells.auto[m]))
-        total += fold * cells.times.sum()
-        in_wedge += fold * cells.times[end:].sum()
+        in_wedge += fold * (upto[-1] - upto[end])
     count = weight.round().astype(int)
     power = _divided(sums, count)
     left_out = dict(cells.left_out)
     if wedge is not None or k_par_min is not None:
         left_out["in the wedge, or below k_par_min"] = round(in_wedge)
-    left_out["k = 0, or outside all bins"] = round(total - in_wedge - weight.sum())
+    left_out["k = 0, or outside all bins"] = round(cells.folds.sum() * upto[-1] - in_wedge - weight.sum())
     sigma = _sigma(power, _divided(both, count), count, cells)
     return Spherical(_divided(k_sum, count), power, sigma, count, edges, cells.frame, left_out, cells, bounds)
+
+
+def _length(k_perp: Any, k_par: Any) -> Float:
+    """|k|, the same to the last digit wherever a cell is put in a bin; np.hypot takes three times as long."""
+    return np.asarray(np.sqrt(k_perp * k_perp + k_par * k_par))
 
 
 def ratio(a: Cylindrical, b: Cylindrical) -> Float:

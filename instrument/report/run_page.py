@@ -12,8 +12,10 @@ from instrument.analyze.subtraction import ManyDirectionsResult
 from instrument.analyze.sweep import Sweep
 from instrument.calibrate.base import Solution
 from instrument.calibrate.di_errors import DIComparison
+from instrument.cube_analysis import CubeResults
 from instrument.image.cube import StokesCube
 from instrument.report.calibration import convergence, gains, residuals
+from instrument.report.cube_page import cube_sections
 from instrument.report.figures import Kind, bubbles, profile
 from instrument.report.images import psf_image, stokes_images
 from instrument.report.laboratory import errors_against_model
@@ -49,6 +51,7 @@ def write_report(
     errors: DIComparison | None = None,
     spectra: dict[str, Spectrum2D] | None = None,
     sweep: Sweep | ManyDirectionsResult | None = None,
+    products: CubeResults | None = None,
 ) -> None:
     """Draw the figures of a run into its folder and write `report.html`; `record` is what `run.json` holds."""
     entries: list[FigureEntry] = []
@@ -71,7 +74,7 @@ def write_report(
             "baselines and times.",
         )
     if cube is not None:
-        if cube.psf is not None:
+        if cube.psf is not None and cube.psf.data is not None:
             draw("psf", psf_image(cube), "Point spread function and the Gaussian fitted to its main lobe.")
         draw("images", stokes_images(cube), "Dirty images of the four Stokes parameters.", wide=True)
     more: list[Section] = []
@@ -104,6 +107,8 @@ def write_report(
             spectra_2d(spectra),
             "2D power spectra of the images, Hann taper; the PSF stays.",
         )
+    if products is not None:
+        more.extend(cube_sections(products, folder))
     sources = None if leakage is None else leakage.table()
     write_page(page_of_run(record, entries, sources, more), folder / "report.html")
 
@@ -118,7 +123,7 @@ def page_of_run(
 
     `sources` is an astropy table of all sources, `more` are sections of other stages, put after the figures. Read are
     name, title, finished, seed, versions, machine, plan (text, engine), seconds, checks, leakage, image, and where
-    given command and stage_errors (stage -> how wrong it may be).
+    given command, kind ("scene" unless said) and stage_errors (stage -> how wrong it may be).
     """
     plan = record.get("plan", {})
     sections = [
@@ -131,13 +136,14 @@ def page_of_run(
         Section("All sources", [_all_sources(sources)] if sources is not None else []),
         Section("To run it again", _again(record)),
     ]
+    finished = record.get("finished", "").replace("T", " ")
     short = [name for name, check in record.get("checks", {}).items() if not check.get("passed", True)]
     verdict = f"Done, but fell short: {', '.join(short)}." if short else "Done; every check held."
     if not record.get("checks"):
         verdict = "Done; nothing was checked."
     return Page(
         title=record.get("title") or record.get("name", "run"),
-        subtitle=f"scene {record.get('name', '')}, finished {record.get('finished', '').replace('T', ' ')}",
+        subtitle=f"{record.get('kind', 'scene')} {record.get('name', '')}, finished {finished}",
         verdict=verdict,
         mark="bad" if short else "good" if record.get("checks") else "",
         cards=_cards(record),

@@ -53,13 +53,13 @@ def spectra_2d(curves: dict[str, Spectrum2D], ax: Axes | None = None) -> Axes:
     unit = "K$^2$" if first.unit == "K" else f"({first.unit})$^2$"
     ax.set(xlabel=r"$k_\perp$ (Mpc$^{-1}$)", ylabel=f"power ({unit} Mpc$^2$)")
     for axis, (left, right) in ((ax.xaxis, ax.get_xlim()), (top.xaxis, ax.get_xlim()), (ax.yaxis, ax.get_ylim())):
-        _number(axis, right / left)
+        log_numbers(axis, right / left)
     ax.grid(color="#dddddd", lw=0.6)
     ax.legend(loc="upper center", bbox_to_anchor=(0.46, -0.16), ncols=min(len(curves), 3), frameon=False)
     return ax
 
 
-def _number(axis: Any, span: float) -> None:
+def log_numbers(axis: Any, span: float) -> None:
     """Numbers at 1, 2, 5 where an axis spans less than 2.5 decades, and at powers of ten where more."""
     if span < 300:
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)))

@@ -139,6 +139,43 @@ class RandomSky(GeneratedSky):
         return _power_laws(names, ra, dec, stokes, self.frequency, index)
 
 
+class FaradaySky(GeneratedSky):
+    """Linearly polarised points without total intensity, uniform over a cap, each at a Faraday depth of its own.
+
+    What an interferometer sees of polarised Galactic emission: its Stokes I is resolved out, so what is seen in I has
+    leaked. P = `flux` at a random angle and a depth (rad/m²) uniform between the two `depths`; P goes as
+    (f / `frequency`)^`spectral_index`. The same `seed` gives the same points.
+    """
+
+    count: Count = 200
+    radius: Radians = float(np.deg2rad(2))
+    flux: Jansky = 1.0
+    depths: tuple[float, float] = (-1.5, 5.0)
+    spectral_index: float = Field(default=0.0, allow_inf_nan=False)
+    frequency: Hertz = 150e6
+    seed: int = Field(default=0, ge=0)
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        if not (0 < self.radius <= np.pi and self.frequency > 0):
+            raise InputError(
+                f"radius = {np.rad2deg(self.radius):g} deg, frequency = {self.frequency:g} Hz: 0 to 180 deg, above 0 Hz"
+            )
+        if not (np.isfinite(self.depths).all() and self.depths[0] <= self.depths[1]):
+            raise InputError(f"depths = {self.depths}: give the least and the most, in rad/m2")
+        return self
+
+    def place(self, centre: Direction) -> PointSky:
+        """The points about a phase centre."""
+        rng = np.random.default_rng(self.seed)
+        ra, dec = _cap(centre, self.radius, rng.random(self.count), rng.random(self.count))
+        linear = self.flux * np.exp(2j * np.pi * rng.random(self.count))
+        stokes = np.stack([0 * linear.real, linear.real, linear.imag, 0 * linear.real], axis=1)
+        names, index = tuple(f"p{k}" for k in range(self.count)), np.full(self.count, self.spectral_index)
+        found = _power_laws(names, ra, dec, stokes, self.frequency, index)
+        return found.with_fields(rotation_measure=rng.uniform(*self.depths, self.count))
+
+
 class MockField(GeneratedSky):
     """A mock of the 3C196 field at 150 MHz: 4567 sources within 5 deg, 796.64 Jy, the figures of Asad et al. (2015).
 

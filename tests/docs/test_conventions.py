@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 from astropy import units as u
 from astropy.coordinates import AltAz, EarthLocation, SkyCoord, get_sun
+from astropy.cosmology import Planck15
 from instrument_plugins.elements.dipole import CrossedDipole
 
 import instrument
 from instrument import (
+    Analyzer,
     Chain,
     Composed,
     FeedTerm,
@@ -19,8 +21,10 @@ from instrument import (
     Observation,
     Parallactic,
     PointSky,
+    Psf,
     Sampling,
     Scene,
+    StokesCube,
     Towards,
     mat2,
     mueller,
@@ -311,3 +315,57 @@ def test_directions_equal_astropy_to_0_003_arcsec_in_the_field_and_0_03_anywhere
         )
         apart = np.linalg.norm(ours.itrf[0] - enu @ axes, axis=-1)
         assert np.rad2deg(apart.max()) * 3600 < limit
+
+
+# cubes
+
+
+def cube_of(field=None, q=None, p=None, count=161, pixels=(40, 40), unit="K", **fields):
+    """161 channels of 0.2 MHz about 150 MHz, pixels of 2 arcmin, with some Stokes parameters (F, Ny, Nx)."""
+    data = np.zeros((count, 4, *pixels))
+    for k, plane in enumerate((field, q, p)):
+        if plane is not None:
+            data[:, k] = plane
+    freq = 150e6 + 0.2e6 * (np.arange(count) - (count - 1) / 2)
+    return StokesCube(data, freq * u.Hz, 2 * u.arcmin, unit, **fields)
+
+
+def test_a_screen_at_plus_7_rad_per_m2_peaks_at_plus_7():
+    lambda2 = (LIGHT / cube_of().freq_hz) ** 2
+    turned = np.exp(2j * 7 * lambda2)[:, None, None]
+    depths = np.linspace(-10, 50, 241)
+    found = Analyzer(cube_of(q=turned.real, p=turned.imag, pixels=(1, 1))).rm_synthesis(depths)
+    assert depths[np.argmax(np.abs(found.data[:, 0, 0]))] == pytest.approx(7)
+
+
+def test_u_alone_is_an_angle_of_45_deg():
+    found = Analyzer(cube_of(p=1.0, pixels=(1, 1))).rm_synthesis([0.0])
+    assert found.data[0, 0, 0] == pytest.approx(1j, abs=1e-12)
+    assert np.rad2deg(np.angle(found.data[0, 0, 0]) / 2) == pytest.approx(45)
+
+
+def test_100_wavelengths_and_a_microsecond_at_150_mhz_in_k():
+    across = 2 * np.deg2rad(1 / 60) * 40
+    delay, wave = 31, 2  # cells; a little off 1 us and 100 wavelengths, in proportion
+    field = np.cos(2 * np.pi * delay * np.arange(161) / 161)[:, None, None] * np.cos(
+        2 * np.pi * wave * np.arange(40) / 40
+    )
+    found = Analyzer(cube_of(field=field)).cylindrical(taper=None, bins=200, log=False)
+    i, j = np.unravel_index(np.nanargmax(found.power), found.power.shape)
+    assert found.k_perp[i] / (wave / across) * 100 == pytest.approx(0.0677, rel=2e-3)
+    assert found.k_par[j] / (delay / (161 * 0.2e6)) * 1e-6 == pytest.approx(0.365, rel=2e-3)
+
+
+def test_white_noise_has_the_power_of_its_voxel():
+    cube = cube_of(field=np.random.default_rng(0).normal(size=(161, 40, 40)))
+    found = Analyzer(cube).spherical(taper=None, bins=[0.1, 0.3, 0.9] / u.Mpc)
+    z = 1420405751.768 / 150e6 - 1
+    across = Planck15.comoving_transverse_distance(z).value * 2 * np.deg2rad(1 / 60)
+    along = LIGHT * (1 + z) ** 2 / (Planck15.H(z).to_value("m / (s Mpc)") * 1420405751.768) * 0.2e6
+    np.testing.assert_allclose(found.power, across**2 * along, rtol=0.03)
+    np.testing.assert_allclose(found.delta2, found.k**3 * found.power / (2 * np.pi**2), rtol=1e-12)
+
+
+def test_a_mjy_per_beam_of_3_arcmin_is_1_676_k():
+    cube = cube_of(field=1e-3, count=1, pixels=(2, 2), unit="Jy/beam", psf=Psf.gaussian(3 * u.arcmin))
+    assert cube.to_kelvin().data[0, 0, 0, 0] == pytest.approx(1.676, rel=1e-3)

@@ -75,6 +75,28 @@ def test_many_directions_leaves_the_noise_and_one_direction_more(tmp_path, capsy
     assert list(folder.glob("*.ecsv"))
 
 
+def test_faraday_leakage_goes_all_the_way_to_the_window(tmp_path):
+    """A sky without I: what is seen in I has leaked, 0.1 to 3 % of P, and is below the 21-cm signal somewhere."""
+    status, folder, record = ran(
+        tmp_path, "faraday-leakage", "observation.interval='2 h'", "observation.frequency.width='1 MHz'",
+        "observation.frequency.channels=32", "image.pixels=80", "image.pixel='3 arcmin'", "image.uv_range=[30,300]",
+        "analyze.cube.uv_range=[30,300]", "sky.count=60", "analyze.cube.depths=[-10,10,0.5]",
+    )  # fmt: skip
+    assert status == 0
+    p, i = (QTable.read(folder / f"spectrum_spherical_{name}.ecsv") for name in "PI")
+    use = p["count"] > 0
+    share = np.sqrt(i["power"][use] / p["power"][use])
+    assert np.all((share > 1e-3) & (share < 0.05))
+    window = QTable.read(folder / "window.ecsv")
+    assert window["open"].any() and window.meta["model"] == "21cmFAST_2011_z9.50"
+    assert {"Faraday depth", "power spectrum of I", "prediction"} <= set(record["checks"])
+    assert all(check["passed"] for check in record["checks"].values())
+    page = (folder / "report.html").read_text()
+    for title in ("Faraday depth", "Power spectra", "EoR window"):
+        assert f">{title}<" in page
+    assert (folder / "faraday_peaks.fits").is_file() and (folder / "window.png").is_file()
+
+
 def test_every_shipped_scene_has_a_plan(capsys):
     for name in shipped():
         assert main(["plan", name]) == 0

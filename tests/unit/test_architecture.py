@@ -22,7 +22,7 @@ HEAVY = {"astropy", "scipy", "numba", "matplotlib", "ducc0", "h5py", "jinja2", "
 # stands for a module or for a whole package.
 LAYERS = (
     ("errors", "data", "scenes", "whole_file"),
-    ("units",),
+    ("units", "run_folder"),
     ("registry", "mat2", "phasor"),
     ("component",),
     ("observe",),
@@ -35,16 +35,18 @@ LAYERS = (
     ("scene",),
     ("calibrate",),
     ("image",),
-    ("foreground",),
     ("analyze",),
+    ("foreground", "foreground_linear", "foreground_score"),
+    ("signal_loss",),
+    ("cube_analysis",),
     ("files",),
     ("report",),
     ("scene_file",),
-    ("conformance", "conformance_bench", "conformance_terms", "conformance_engines"),
+    ("conformance", "conformance_bench", "conformance_terms", "conformance_engines", "conformance_foregrounds"),
     ("calibration_run",),
     ("doctor",),
     ("run_record",),
-    ("run",),
+    ("run", "analyze_run"),
     ("",),  # `instrument` itself, which looks names up in all of them when they are first used
     ("cli",),
 )

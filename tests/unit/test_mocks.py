@@ -8,8 +8,8 @@ from scipy.stats import kstest
 import instrument
 from instrument.component import Component
 from instrument.errors import InputError
-from instrument.observe.directions import lmn
-from instrument.sky.mocks import FIELD, GridSky, MockField, RandomSky, mock_fluxes
+from instrument.observe.directions import LIGHT, lmn
+from instrument.sky.mocks import FIELD, FaradaySky, GridSky, MockField, RandomSky, mock_fluxes
 from instrument.sky.readers import read
 from instrument.units import Direction
 
@@ -187,3 +187,20 @@ def test_a_sky_that_has_not_been_placed_says_so(ask):
 def test_impossible_settings_are_refused(make, message):
     with pytest.raises(InputError, match=message):
         make()
+
+
+def test_a_faraday_sky_has_no_total_intensity_and_turns_with_the_wavelength():
+    sky = FaradaySky(count=50, flux=2 * u.Jy, depths=(3.0, 3.0), spectral_index=-1.0, radius=2 * u.deg, seed=4)
+    placed = sky.about(CENTRE)
+    freq = np.array([150e6, 140e6])
+    at = placed.stokes(freq)
+    assert not at[..., [0, 3]].any()
+    p = at[..., 1] + 1j * at[..., 2]
+    np.testing.assert_allclose(np.abs(p[0]), 2, rtol=1e-12)
+    np.testing.assert_allclose(np.abs(p[1]), 2 * 150 / 140, rtol=1e-12)
+    turn = 2 * 3.0 * np.diff((LIGHT / freq) ** 2)[0]
+    np.testing.assert_allclose(np.angle(p[1] / p[0]), np.angle(np.exp(1j * turn)), rtol=1e-9)
+    assert np.rad2deg(placed.distance_rad(CENTRE).max()) <= 2 + 1e-9
+    for wrong, said in (({"depths": (2.0, 1.0)}, "least and the most"), ({"radius": 0 * u.deg}, "0 to 180 deg")):
+        with pytest.raises(InputError, match=said):
+            FaradaySky(**wrong)
