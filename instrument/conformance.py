@@ -29,7 +29,7 @@ from instrument.conformance_bench import (
     problems,
 )
 from instrument.errors import InputError, InstrumentError, InstrumentWarning
-from instrument.foreground import ForegroundRemover
+from instrument.foreground.base import ForegroundRemover
 from instrument.jones.base import JonesTerm
 from instrument.model import Instrument
 from instrument.observe.sampling import Sampling

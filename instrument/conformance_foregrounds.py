@@ -6,7 +6,7 @@ import numpy as np
 
 from instrument.conformance_bench import demand, demand_repeatable, demand_same
 from instrument.errors import Outcome
-from instrument.foreground import ForegroundRemover
+from instrument.foreground.base import ForegroundRemover
 from instrument.image.cube import StokesCube
 from instrument.units import Float
 

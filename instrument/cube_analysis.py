@@ -24,7 +24,7 @@ from instrument.analyze.spectra import Spectrum2D
 from instrument.analyze.window import EoRWindow
 from instrument.component import Component
 from instrument.errors import InputError, InstrumentWarning, Outcome
-from instrument.foreground import ForegroundRemover, Split
+from instrument.foreground.base import ForegroundRemover, Split
 from instrument.image.cube import StokesCube
 from instrument.registry import load
 from instrument.units import Float, Radians, Seconds

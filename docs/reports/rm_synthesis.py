@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 from astropy import units as u
 from RMutils.util_RM import do_rmclean_hogbom, do_rmsynth_planes
+from threadpoolctl import threadpool_limits
 
 from instrument import Analyzer, StokesCube
 from instrument.observe.directions import LIGHT
@@ -97,6 +98,10 @@ def main():
     def peer():
         return do_rmsynth_planes(q, v, L2, PHI, nBits=32, log=quiet).FDFcube
 
+    def peer_alone():  # on a busy machine threads that wait for one another make it slower
+        with threadpool_limits(1, user_api="openmp"):
+            return peer()
+
     def planes():
         return loop(whole, PHI[some])
 
@@ -107,15 +112,18 @@ def main():
     ways = {
         "ours, complex64": (ours, 1.0),
         "ours, complex128": (ours_double, 1.0),
-        "RM-Tools, nBits=32": (peer, 1.0),
+        "RM-Tools, nBits=32, all threads": (peer, 1.0),
+        "RM-Tools, nBits=32, one thread": (peer_alone, 1.0),
         f"published loop over depths ({SOME_DEPTHS} of 401, scaled)": (published, len(PHI) / SOME_DEPTHS),
         f"thrifty loop over depths ({SOME_DEPTHS} of 401, scaled)": (planes, len(PHI) / SOME_DEPTHS),
     }
     spent, error = {name: [] for name in ways}, {}
-    for work, _ in ways.values():  # compiled, loaded, planned
+    for work in (ours, ours_double, peer_alone):  # compiled, loaded, planned
         work()
-    for _ in range(given.runs):
+    for run in range(given.runs):
         for name, (work, scale) in ways.items():
+            if work is peer and run >= 3:
+                continue
             seconds, found = timed(work)
             spent[name].append(seconds * scale)
             rows = some if work in (planes, published) else slice(None)

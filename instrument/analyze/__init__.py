@@ -1,1 +1,1 @@
-"""Analysis of images and visibilities: leakage of sources."""
+"""Analysis of images and visibilities: leakage, Faraday depth, power spectra, the EoR window."""

@@ -8,8 +8,8 @@ import numpy as np
 from pydantic import BeforeValidator, Field
 
 from instrument.errors import Outcome
-from instrument.foreground import ForegroundRemover, Separation
-from instrument.foreground_linear import leading, projection
+from instrument.foreground.base import ForegroundRemover, Separation
+from instrument.foreground.linear import leading, projection
 from instrument.observe.directions import LIGHT
 from instrument.units import Float, to_si
 

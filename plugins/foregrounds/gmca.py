@@ -11,8 +11,8 @@ from instrument_plugins.foregrounds.starlet import GAINS, SMOOTH, starlet
 from pydantic import Field
 
 from instrument.errors import Outcome
-from instrument.foreground import ForegroundRemover, Separation
-from instrument.foreground_linear import apply, covariance, leading, principal, projection, seen
+from instrument.foreground.base import ForegroundRemover, Separation
+from instrument.foreground.linear import apply, covariance, leading, principal, projection, seen
 from instrument.units import Bool, Float
 
 

@@ -8,8 +8,8 @@ import numpy as np
 from pydantic import Field
 
 from instrument.errors import Outcome
-from instrument.foreground import ForegroundRemover, Separation
-from instrument.foreground_linear import covariance, one_thread
+from instrument.foreground.base import ForegroundRemover, Separation
+from instrument.foreground.linear import covariance, one_thread
 from instrument.units import Float
 
 # lengths in Hz of smooth emission, mode mixing and 21-cm signal (after Mertens et al. 2018, MNRAS 478, 3640)

@@ -10,8 +10,8 @@ import numpy as np
 from pydantic import Field
 
 from instrument.errors import Outcome, PluginError
-from instrument.foreground import ForegroundRemover, Separation
-from instrument.foreground_linear import projection, seen
+from instrument.foreground.base import ForegroundRemover, Separation
+from instrument.foreground.linear import projection, seen
 from instrument.units import Float
 
 

@@ -7,8 +7,8 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from instrument.errors import Outcome
-from instrument.foreground import ForegroundRemover, Separation
-from instrument.foreground_linear import principal, projection
+from instrument.foreground.base import ForegroundRemover, Separation
+from instrument.foreground.linear import principal, projection
 from instrument.units import Float
 
 

@@ -8,8 +8,8 @@ import numpy as np
 from pydantic import Field
 
 from instrument.errors import Outcome
-from instrument.foreground import ForegroundRemover, Separation
-from instrument.foreground_linear import projection
+from instrument.foreground.base import ForegroundRemover, Separation
+from instrument.foreground.linear import projection
 from instrument.units import Float
 
 

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 
 from instrument.errors import Outcome
-from instrument.foreground_linear import one_thread, pinv, principal
+from instrument.foreground.linear import one_thread, pinv, principal
 from instrument.units import Float
 
 MAD = 0.6744897501960817  # median |x| of a normal deviate of rms 1

@@ -16,8 +16,8 @@ from instrument_plugins.foregrounds.starlet import GAINS, SMOOTH, starlet, starl
 import instrument
 from instrument import Analyzer, InputError, Outcome, StokesCube, signal_loss
 from instrument.analyze.signal import Signal21cm
-from instrument.foreground_linear import covariance
-from instrument.foreground_score import noise_power
+from instrument.foreground.linear import covariance
+from instrument.foreground.score import noise_power
 from instrument.image.mocks import FINE, leaked, noise_cube, polarized_screens
 
 SCREENS = FINE.with_fields(width=0.5, floor=0.05, slope=3.5, uv_range=(10.0, 800.0))
@@ -37,11 +37,10 @@ def screens():
 
 @cache
 def case(name):
-    """(cube, true foreground): `quiet`, `white`, `psf` or `none`; Q, U, V are noise or 0."""
+    """(cube, true foreground): `quiet`, `white` or `psf`; Q, U, V are noise or 0."""
     like = screens()
     rms, noise, shaped = {
         "quiet": (7.1e-3, 0.2e-3, False),
-        "none": (7.1e-3, 0.0, False),
         "white": (7.1e-3, 0.06, False),
         "psf": (4.5e-3, 0.06, True),
     }[name]
@@ -78,10 +77,8 @@ def test_four_components_take_the_quiet_leakage_down_a_hundred_times_and_touch_n
 
 
 def test_more_components_leave_less():
-    scores = [
-        load("gmca", components=n).split(case("quiet")[0]).score(foreground=case("quiet")[1]).value for n in (2, 6)
-    ]
-    assert scores[0] > 1.5 * split("gmca", "quiet").score(foreground=case("quiet")[1]).value > 4.5 * scores[1]
+    six = load("gmca", components=6).split(case("quiet")[0]).score(foreground=case("quiet")[1]).value
+    assert six < split("gmca", "quiet").score(foreground=case("quiet")[1]).value / 3
 
 
 def test_under_white_noise_the_published_scheme_removes_nothing():
@@ -106,8 +103,6 @@ def test_under_noise_of_the_shape_of_the_psf_every_projection_says_that_it_made_
 
 def test_so_does_the_published_scheme():
     assert paper("psf").score(foreground=case("psf")[1]).value > 1.2
-    text = str(paper("psf"))  # of 128 pixels the foreground itself is hardly seen
-    assert "worse than not cleaning: do not use" in text or "leave it alone" in text
 
 
 def test_under_the_same_noise_the_gaussian_process_and_thresholds_stay_below_one():
@@ -130,7 +125,7 @@ def test_the_estimated_score_agrees_with_the_true_one(name, of):
 
 @pytest.mark.parametrize("name", FIXED)
 def test_the_draw_and_the_trace_agree_for_a_fixed_operator(name):
-    from instrument.foreground_score import estimated_score
+    from instrument.foreground.score import estimated_score
 
     found = split(name, "psf")
     maps, cube = case("psf")[0].data[:, 0], case("psf")[0]
@@ -226,12 +221,11 @@ def test_the_gaussian_process_finds_its_noise_and_gives_a_posterior_covariance()
     assert np.trace(found.covariance) < 161 * 7.5e-3**2
 
 
-def test_what_is_left_in_projection_depends_on_the_span_alone():
-    # at high signal to noise GMCA spans what principal components do
-    one, two = (split(name, "none").residual.data[:, 0] for name in ("gmca", "pca"))
-    assert np.sum(one**2, dtype=float) == pytest.approx(np.sum(two**2, dtype=float), rel=0.5)
-    for name in ("gmca", "pca"):
-        s = split(name, "none").separation
+def test_a_projection_leaves_a_little_more_than_principal_components_which_leave_the_least():
+    left = {name: np.sum(split(name, "quiet").residual.data[:, 0] ** 2, dtype=float) for name in ("gmca", "pca")}
+    assert left["pca"] <= left["gmca"] < 1.5 * left["pca"]
+    for name in left:
+        s = split(name, "quiet").separation
         np.testing.assert_allclose(s.operator @ s.operator, s.operator, atol=1e-9)
         np.testing.assert_allclose(s.mixing @ np.linalg.pinv(s.mixing), s.operator, atol=1e-9)
 

@@ -27,8 +27,8 @@ from instrument.component import Component
 from instrument.conformance import Report, check
 from instrument.conformance_bench import bench, hard_places, lofar_like, random_sky
 from instrument.errors import InputError, InstrumentError, Outcome
-from instrument.foreground import ForegroundRemover
-from instrument.foreground_linear import projection
+from instrument.foreground.base import ForegroundRemover
+from instrument.foreground.linear import projection
 from instrument.jones.base import ElementBeam, JonesTerm
 from instrument.jones.station import ArrayFactor, Level
 from instrument.mat2 import IDENTITY

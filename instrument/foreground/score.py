@@ -24,7 +24,7 @@ import numpy as np
 
 from instrument.analyze.fourier import comoving, line_of_sight, taper_of
 from instrument.errors import InputError
-from instrument.foreground_linear import apply, covariance, one_thread
+from instrument.foreground.linear import apply, covariance, one_thread
 from instrument.units import Bool, Float
 
 NOISE_FROM = 0.3  # 1/Mpc: delays beyond it hold noise

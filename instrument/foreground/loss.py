@@ -11,7 +11,7 @@ import numpy as np
 from instrument.analyze.analyzer import Analyzer
 from instrument.analyze.fourier import Taper
 from instrument.errors import InputError
-from instrument.foreground import ForegroundRemover
+from instrument.foreground.base import ForegroundRemover
 from instrument.image.cube import StokesCube
 from instrument.units import Float, Int
 from instrument.whole_file import write_ecsv

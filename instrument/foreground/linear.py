@@ -12,7 +12,7 @@ from instrument.units import Bool, Float
 
 if TYPE_CHECKING:
     from instrument.errors import Outcome
-    from instrument.foreground import Separation
+    from instrument.foreground.base import Separation
 
 RANGE = 1e-9  # of the largest eigenvalue that one covariance is trusted for
 CHUNK = 16384  # pixels turned to float64 at once: 21 MB at 161 channels
@@ -91,7 +91,7 @@ def projection(
     Mixing has unit columns of positive sum, ordered by the power of their components S = A^+ X. Directions below
     `rank` of the largest singular value of A are left out of A^+.
     """
-    from instrument.foreground import Separation
+    from instrument.foreground.base import Separation
 
     length = np.sqrt((columns**2).sum(axis=0))
     a = columns / np.where(length > 0, length, 1.0)

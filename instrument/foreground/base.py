@@ -12,8 +12,8 @@ import numpy as np
 
 from instrument.component import Component
 from instrument.errors import InputError, InstrumentWarning, Outcome
-from instrument.foreground_linear import apply
-from instrument.foreground_score import Score, estimated_score, true_score
+from instrument.foreground.linear import apply
+from instrument.foreground.score import Score, estimated_score, true_score
 from instrument.image.cube import StokesCube
 from instrument.units import Bool, Float, Int
 
@@ -198,7 +198,7 @@ class Split:
 
         Over delays |k_par| below `k_par` and `k_perp` between two values (1/Mpc, Planck15). With the true `foreground`
         (a cube, or maps (F, Ny, Nx)): what it differs by from the one found. Without, an unbiased estimate of the same
-        from the cube alone (`instrument.foreground_score`); an adapted operator is then run once more on the cube with
+        from the cube alone (`instrument.foreground.score`); an adapted operator is then run once more on the cube with
         a draw of noise (`seed`) added. Raises `InputError` where the cube has too few channels or pixels for that.
         """
         options = (k_par, k_perp, taper)

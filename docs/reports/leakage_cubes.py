@@ -1,0 +1,53 @@
+"""Cubes of the reports on foreground removal: leaked Faraday screens, quiet and under noise."""
+
+import numpy as np
+from astropy import units as u
+
+from instrument.image.mocks import FINE, leaked, noise_cube, polarized_screens
+
+# 27 screens of which that at 1.2 rad/m^2 stands out; steep, so that 7.1 mK are mostly on scales beyond a degree
+SCREENS = FINE.with_fields(width=0.5, floor=0.05, slope=3.5, uv_range=(10.0, 800.0))
+RMS = 7.1e-3  # K
+CASES = {
+    "quiet (0.2 mK)": (0.2e-3, False),
+    "60 mK white": (60e-3, False),
+    "60 mK PSF-shaped": (60e-3, True),
+    "10 mK PSF-shaped": (10e-3, True),
+}
+
+
+def leakage(pixels, seed):
+    """Stokes I of leaked screens, 7.1 mK rms, 161 channels from 134 to 166 MHz, pixels of 0.5'; Q = U = V = 0."""
+    cube = leaked(polarized_screens(pixels=pixels, pixel=0.5 * u.arcmin, screens=SCREENS, seed=seed))
+    data = np.zeros_like(cube.data)
+    data[:, 0] = cube.data[:, 0] * np.float32(RMS / cube.data[:, 0].std())
+    return cube.with_data(data)
+
+
+def observed(truth, case, seed):
+    """The leakage with the noise of a case, in Stokes I."""
+    noise, shaped = CASES[case]
+    data = noise_cube(truth, noise * u.K, shaped, seed).data
+    data[:, 0] += truth.data[:, 0]
+    return truth.with_data(data)
+
+
+def removers():
+    """Name on the page -> remover; independent components only where scikit-learn is installed."""
+    from importlib.util import find_spec
+
+    import instrument
+
+    def load(name, **settings):
+        return instrument.load("foregrounds", name, **settings)
+
+    found = {
+        "gmca": load("gmca"),
+        'gmca, mode="threshold"': load("gmca", mode="threshold"),
+        "gmca, paper=True": load("gmca", paper=True),
+        "pca": load("pca"),
+        "polynomial": load("polynomial"),
+        "faraday-filter": load("faraday-filter"),
+        "gpr": load("gpr"),
+    }
+    return found | ({"ica": load("ica")} if find_spec("sklearn") else {})
