@@ -10,6 +10,7 @@ from instrument.analyze.cells import Cells
 from instrument.analyze.faraday_cube import FaradayCube
 from instrument.analyze.fourier import taper_of
 from instrument.image.cube import StokesCube
+from instrument.units import Complex, Float
 
 
 class CubeCheck(NamedTuple):
@@ -53,20 +54,33 @@ def check_cells(cube: StokesCube, cells: Cells, samples: int = 16, seed: int = 0
     rng = np.random.default_rng(seed)
     n, m = rng.integers(len(cells.k_perp), size=samples), rng.integers(len(cells.k_par), size=samples)
     order = np.argsort(cube.freq_hz, kind="stable")
-    planes = cube.data[:, 1:3] if frame.stokes == "P" else cube.data[:, ["IQUV".index(frame.stokes)]]
+    names = "QU" if frame.stokes == "P" else frame.stokes
     ny, nx = cube.data.shape[2:]
-    has = ~np.isnan(planes).any(axis=(0, 1))
+
+    def image(channel: int) -> Complex | Float:
+        parts = [np.asarray(cube.data[channel, "IQUV".index(name)], float) for name in names]
+        return parts[0] if len(parts) == 1 else parts[0] + 1j * parts[1]
+
+    has = np.ones((ny, nx), bool)
+    for channel in order:
+        if np.isnan((found := image(channel)).sum()):
+            has &= ~np.isnan(found)
     window = has * np.multiply.outer(taper_of(ny, frame.taper_space), taper_of(nx, frame.taper_space))
     rows = np.exp(-2j * np.pi * np.multiply.outer(cells.v_index[n], np.arange(ny)) / ny)
-    columns = np.exp(-2j * np.pi * np.multiply.outer(cells.u_index[n], np.arange(nx)) / nx)
+    turn = 2 * np.pi * np.multiply.outer(np.arange(nx), cells.u_index[n]) / nx
+    columns = np.concatenate([np.cos(turn), -np.sin(turn)], axis=1)  # real: most images are
+
+    def cell(plane: Complex | Float) -> Complex:
+        real, imag = np.split(plane @ columns, 2, axis=1)
+        return np.asarray(np.einsum("sy,ys->s", rows, real + 1j * imag))
+
     sums = np.empty((len(order), samples), complex)
-    part = np.array([1, 1j])[: planes.shape[1]]
-    ones = np.einsum("sx,sx->s", rows @ window, columns)  # the mean goes through the window too
+    ones = cell(window)  # the mean goes through the window too
     total = 0j
     for k, channel in enumerate(order):
-        image = np.tensordot(part, np.nan_to_num(planes[channel].astype(float)), axes=1)
-        total += image[has].mean()
-        sums[k] = np.einsum("sx,sx->s", rows @ (image * window), columns)
+        found = image(channel)
+        total += found[has].mean()
+        sums[k] = cell(found * window if has.all() else np.where(has, found, 0) * window)
     sums -= total / len(order) * ones
     along = taper_of(len(order), frame.taper)
     delays = np.exp(-2j * np.pi * np.multiply.outer(m, np.arange(len(order))) / len(order))
