@@ -97,7 +97,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     warnings.showwarning = _show_warning  # type: ignore[assignment]
     try:
-        given = parser().parse_args(_joined(sys.argv[1:] if argv is None else argv))
+        words = _joined(sys.argv[1:] if argv is None else argv)
+        given = parser().parse_args(words)
+        given.words = words
         return int(VERBS[given.verb](given))
     except InputError as error:
         print(f"instrument: {_flat(error)}", file=sys.stderr)
@@ -185,7 +187,7 @@ def _analyze(given: argparse.Namespace) -> int:
         if (text := getattr(given, name)) is not None:
             fields[name] = None if text == "none" else text
     settings = CubeAnalysis(remover=override({}, given.remover), cubes=given.cubes, **fields)
-    words = ["instrument", *sys.argv[1:]]
+    words = ["instrument", *given.words]
     result = analyze_files(
         given.files, settings, given.out, given.stokes, given.unit, given.beam, given.noise, shlex.join(words), print
     )
