@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -16,8 +17,45 @@ from instrument.units import Float, Int, to_si
 from instrument.whole_file import write_ecsv
 
 
+class _Spectrum(ABC):
+    """What both spectra have: the unit and redshift of their cube, noise taken off, a table written."""
+
+    frame: Frame
+    power: Float
+    sigma: Float
+
+    @property
+    def unit(self) -> str:
+        """Unit of the cube."""
+        return self.frame.unit
+
+    @property
+    def redshift(self) -> float:
+        """The redshift that serves the whole band."""
+        return self.frame.redshift
+
+    def less(self, noise: Self) -> Self:
+        """The same less the power of noise (its bias taken off); errors add in squares. Raises for other bins."""
+        _demand_same(self, noise)
+        sigma = np.hypot(self.sigma, noise.sigma)
+        found: Self = replace(self, power=self.power - noise.power, sigma=sigma)  # type: ignore[type-var]
+        return found
+
+    @abstractmethod
+    def edges_of(self) -> tuple[Float, ...]:
+        """Edges of the bins, an array for each axis, 1/Mpc."""
+
+    @abstractmethod
+    def table(self) -> Any:
+        """Everything as an astropy table, one row a bin, with units."""
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write the table as ECSV; the file is whole or not there."""
+        write_ecsv(self.table(), path)
+
+
 @dataclass(frozen=True, eq=False)
-class Cylindrical:
+class Cylindrical(_Spectrum):
     """Power spectrum of a cube in bins of k_perp (P,) and |k_par| (L,): P = V / N² mean |DFT|², `unit`² Mpc³ (P, L).
 
     `k_perp` and `k_par` (1/Mpc) are means over the cells of a bin `edges[i] <= k < edges[i+1]`, the last one closed;
@@ -37,16 +75,6 @@ class Cylindrical:
     cells: Cells
 
     @property
-    def unit(self) -> str:
-        """Unit of the cube."""
-        return self.frame.unit
-
-    @property
-    def redshift(self) -> float:
-        """The redshift that serves the whole band."""
-        return self.frame.redshift
-
-    @property
     def delta2(self) -> Float:
         """k_perp² k_par P / (2 pi)², `unit`² (P, L): the paper's; half the variance per ln k_perp and ln k_par."""
         return self.k_perp[:, None] ** 2 * self.k_par * self.power / (2 * np.pi) ** 2
@@ -56,6 +84,10 @@ class Cylindrical:
         """k³ P / 2 pi² with k² = k_perp² + k_par², `unit`² (P, L): what a spherical spectrum has at that k."""
         k = np.hypot(self.k_perp[:, None], self.k_par)
         return k**3 * self.power / (2 * np.pi**2)
+
+    def edges_of(self) -> tuple[Float, ...]:
+        """Edges of the bins of k_perp and of k_par, 1/Mpc."""
+        return self.perp_edges, self.par_edges
 
     def wedge(self, angle: Any) -> Float:
         """k_par (P,) below which smooth sources within `angle` of the phase centre lie; 90 deg is the horizon."""
@@ -76,11 +108,6 @@ class Cylindrical:
                 values[part] = model(np.hypot(cells.k_perp[part], k_par))
                 sums[:, row] += fold * cells.sums(bounds, values)
         return _divided(sums, self.count)
-
-    def less(self, noise: Cylindrical) -> Cylindrical:
-        """The same less the power of noise (its bias taken off); errors add in squares. Raises for other bins."""
-        _demand_same(self, noise)
-        return replace(self, power=self.power - noise.power, sigma=np.hypot(self.sigma, noise.sigma))
 
     def table(self) -> Any:
         """Everything as an astropy table, one row a bin, with units."""
@@ -103,13 +130,9 @@ class Cylindrical:
         out.meta |= _about(self.frame, self.left_out)
         return out
 
-    def write(self, path: str | os.PathLike[str]) -> None:
-        """Write the table as ECSV; the file is whole or not there."""
-        write_ecsv(self.table(), path)
-
 
 @dataclass(frozen=True, eq=False)
-class Spherical:
+class Spherical(_Spectrum):
     """Power spectrum of a cube in bins of k (N,), `unit`² Mpc³; fields as those of `Cylindrical`."""
 
     k: Float
@@ -122,15 +145,9 @@ class Spherical:
     cells: Cells
     bounds: Int  # of each delay, where bins begin among the cells (M, N + 1)
 
-    @property
-    def unit(self) -> str:
-        """Unit of the cube."""
-        return self.frame.unit
-
-    @property
-    def redshift(self) -> float:
-        """The redshift that serves the whole band."""
-        return self.frame.redshift
+    def edges_of(self) -> tuple[Float, ...]:
+        """Edges of the bins of k, 1/Mpc."""
+        return (self.edges,)
 
     @property
     def delta2(self) -> Float:
@@ -147,11 +164,6 @@ class Spherical:
             sums += fold * cells.sums(bounds, values)
         return _divided(sums, self.count)
 
-    def less(self, noise: Spherical) -> Spherical:
-        """The same less the power of noise (its bias taken off); errors add in squares. Raises for other bins."""
-        _demand_same(self, noise)
-        return replace(self, power=self.power - noise.power, sigma=np.hypot(self.sigma, noise.sigma))
-
     def table(self) -> Any:
         """Everything as an astropy table, one row a bin, with units."""
         from astropy import units as u
@@ -165,10 +177,6 @@ class Spherical:
         out["delta2"], out["count"] = self.delta2 * squared, self.count
         out.meta |= _about(self.frame, self.left_out)
         return out
-
-    def write(self, path: str | os.PathLike[str]) -> None:
-        """Write the table as ECSV; the file is whole or not there."""
-        write_ecsv(self.table(), path)
 
 
 def cylindrical(
@@ -270,10 +278,10 @@ def ratio(a: Cylindrical, b: Cylindrical) -> Float:
     return np.divide(a.power, b.power, out=np.full(a.power.shape, np.nan), where=b.power > 0)
 
 
-def _demand_same(a: Cylindrical | Spherical, b: Cylindrical | Spherical) -> None:
-    one, two = ((s.perp_edges, s.par_edges) if isinstance(s, Cylindrical) else (s.edges, s.edges[:1]) for s in (a, b))
-    same = all(x.shape == y.shape and np.allclose(x, y, rtol=1e-9, atol=0) for x, y in zip(one, two, strict=True))
-    if not same or a.unit != b.unit:
+def _demand_same(a: _Spectrum, b: _Spectrum) -> None:
+    pairs = list(zip(a.edges_of(), b.edges_of(), strict=False))
+    same = a.unit == b.unit and all(x.shape == y.shape and np.allclose(x, y, rtol=1e-9, atol=0) for x, y in pairs)
+    if not same:
         raise InputError("spectra differ in bins or unit: make both with the same uv_range, bins, redshift, and unit")
 
 
