@@ -9,7 +9,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from instrument.cube_analysis import CubeAnalysis, CubeResults
+import numpy as np
+
+from instrument.cube_analysis import CubeAnalysis
+from instrument.cube_results import CubeResults
 from instrument.doctor import package_version
 from instrument.errors import InputError
 from instrument.files.fits import read_cube
@@ -37,7 +40,7 @@ def analyze_files(
     """
     folder = RunFolder(Path(paths[0]).name.split(".fits")[0], out)
     cube = _read(paths, stokes, unit, beam)
-    quiet = None if noise is None else _read([noise], stokes, unit, beam)
+    quiet = None if noise is None else _noise(noise, cube, stokes, unit)
     settings.refusals(cube)
     with folder, progress_bar(f"analyze {paths[0]}") as update:
         result = settings.run(cube, quiet, update)
@@ -62,7 +65,21 @@ def _read(paths: Sequence[str], stokes: str | None, unit: Any, beam: str | None)
     from astropy import units as u
 
     psf = Psf.gaussian(*parts).of(len(cube.freq_hz))
+    if not 0 < min(psf.major_rad[0], psf.minor_rad[0]) <= max(psf.major_rad[0], psf.minor_rad[0]) < np.pi:
+        raise InputError(f"--beam {beam}: widths must be above 0 and finite, such as '3 arcmin'")
     return StokesCube(cube.data, cube.freq_hz * u.Hz, cube.pixel_rad * u.rad, cube.unit, cube.centre, psf)
+
+
+def _noise(path: str, cube: StokesCube, stokes: str | None, unit: Any) -> StokesCube:
+    """A cube of noise; what its file does not say is as for the cubes."""
+    try:
+        found = _read([path], None, None, None)
+    except InputError:
+        found = _read([path], stokes, unit, None)
+    from astropy import units as u
+
+    psf = cube.psf if found.psf is None and len(found.freq_hz) == len(cube.freq_hz) else found.psf
+    return StokesCube(found.data, found.freq_hz * u.Hz, found.pixel_rad * u.rad, found.unit, found.centre, psf)
 
 
 def _write(result: CubeResults, paths: Sequence[str], command: str, folder: Path) -> None:

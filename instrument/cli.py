@@ -110,6 +110,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("instrument: stopped; nothing was written", file=sys.stderr)
         return FAILED
+    except MemoryError:
+        print("instrument: not enough memory: ask for fewer depths, channels or pixels", file=sys.stderr)
+        return FAILED
     except BrokenPipeError:
         return DONE
 
@@ -176,6 +179,11 @@ def _analyze(given: argparse.Namespace) -> int:
         except ValueError:
             raise InputError(f"--{name.replace('_', '-')} {text}: numbers with commas between, please") from None
 
+    for setting in given.remover:
+        if "=" not in setting:
+            raise InputError(f"--remover {setting}: write it like --remover components=4")
+    if given.depths is not None and given.depths.count(",") != 2:
+        raise InputError(f"--depths {given.depths}: give the first, the last and the step, as -50,50,0.25")
     fields: dict[str, Any] = {
         "products": None if given.products is None else tuple(p.strip() for p in given.products.split(",")),
         "depths": listed("depths"),

@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-import time
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections.abc import Callable
 from typing import Annotated, Any, Literal, Self, get_args
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from instrument.analyze.analyzer import Analyzer
-from instrument.analyze.cube_checks import CubeCheck, check_cells, check_faraday
-from instrument.analyze.cylinders import Cylindrical, Spherical
-from instrument.analyze.faraday_cube import FaradayCube
-from instrument.analyze.faraday_peaks import FaradayPeaks
+from instrument.analyze.channel_grid import even_channels
+from instrument.analyze.cube_checks import check_cells, check_faraday
 from instrument.analyze.fourier import Stokes, Taper
 from instrument.analyze.signal import DEFAULT, Signal21cm
-from instrument.analyze.spectra import Spectrum2D
-from instrument.analyze.window import EoRWindow
 from instrument.component import Component
-from instrument.errors import InputError, InstrumentWarning, Outcome
-from instrument.foreground.base import ForegroundRemover, Split
+from instrument.cube_results import CubeResults
+from instrument.errors import InputError, InstrumentWarning
+from instrument.foreground.base import ForegroundRemover
 from instrument.image.cube import StokesCube
 from instrument.registry import load
 from instrument.units import Float, Radians, Seconds
@@ -95,15 +88,36 @@ class CubeAnalysis(Component):
             out.setdefault("faraday", "no Stokes Q and U with data")
         if "I" not in there:
             out.setdefault("window", "no Stokes I with data, whose power is the leakage")
-        if cube.unit != "K" and not _has_beam(cube):
+        missing = self._missing(cube, there)
+        if missing is not None:
+            out = dict.fromkeys(("cylindrical", "spherical", "window"), missing) | out
+        if cube.unit == "Jy/beam" and not _has_beam(cube):
             text = f"the cube is in {cube.unit} and its beam is not known: give the beam (--beam), or the cube in K"
             out.setdefault("window", text)
         if self.remove is not None and len(cube.freq_hz) < 2:
             raise InputError(f"remove = '{self.remove}': one channel has no foreground that is smooth along frequency")
+        if not there:
+            raise InputError("the cube has no data: every voxel is NaN or zero")
+        if self.remove is not None and (remover := self.foreground_remover()) and remover.stokes not in there:
+            raise InputError(f"remove = '{self.remove}': Stokes {remover.stokes} of the cube has no data")
         asked = [f"'{name}': {out[name]}" for name in self.products or () if name in out]
         if asked:
             raise InputError(f"products = {'; '.join(asked)}")
         return out
+
+    def _missing(self, cube: StokesCube, there: list[str]) -> str | None:
+        """Why the channels of a cube have no delays, if so."""
+        if len(cube.freq_hz) < 2:
+            return None
+        try:
+            even_channels(cube, self.infill is not None)
+        except InputError as error:
+            return str(error)
+        planes = [cube.data[:, "IQUV".index(name)] for name in there]
+        holes = sum(any(np.isnan(plane[k]).all() for plane in planes) for k in range(len(cube.freq_hz)))
+        if holes and self.infill is None:
+            return f"{holes} channels are all NaN: fill them in with infill (--infill '300 ns')"
+        return None
 
     def run(
         self,
@@ -120,7 +134,7 @@ class CubeAnalysis(Component):
         for name in "IQUV":
             if name not in stokes_of(cube):
                 result.left_out[f"Stokes {name}"] = "no data, or zero everywhere"
-        kelvin = cube.to_kelvin() if cube.unit != "K" and _has_beam(cube) else cube
+        kelvin = cube.to_kelvin() if cube.unit == "Jy/pixel" or _has_beam(cube) else cube
         if noise is not None and noise.unit != kelvin.unit:
             noise = noise.to_kelvin()
         with warnings.catch_warnings(record=True) as said:
@@ -150,14 +164,16 @@ class CubeAnalysis(Component):
             result.checks["Faraday depth"] = check_faraday(cube, found)
         with result.timed("Faraday depth"):
             result.faraday, result.peaks = found, found.peaks()
-            top = np.where(np.isfinite(result.peaks.snr), result.peaks.snr, -1)
+            top = np.nan_to_num(np.abs(found.data[0]))
+            for plane in found.data[1:]:
+                np.maximum(top, np.nan_to_num(np.abs(plane)), out=top)
             result.brightest = tuple(int(i) for i in np.unravel_index(int(np.argmax(top)), top.shape))
             y, x = result.brightest
             spectrum = cube.data[:, :, y : y + 1, x : x + 1]
             pixel = StokesCube(spectrum, cube.freq_hz * u.Hz, cube.pixel_rad * u.rad, cube.unit)
             alone: tuple[Stokes, ...] = ("I", "P", "V")
             for stokes in alone:
-                if stokes == "P" or stokes in stokes_of(cube):
+                if stokes == "P" or np.nan_to_num(spectrum[:, "IQUV".index(stokes)]).any():
                     result.lines[stokes] = Analyzer(pixel).rm_synthesis(self.depth_axis(), stokes=stokes)
 
     def _split(self, cube: StokesCube, result: CubeResults) -> None:
@@ -178,7 +194,7 @@ class CubeAnalysis(Component):
             analyzer = Analyzer(one)
             if "spectrum-2d" in wanted:
                 with result.timed("2D spectra"):
-                    middle = int(np.argsort(cube.freq_hz)[len(cube.freq_hz) // 2])
+                    middle = _middle(one, "Q" if stokes == "P" else stokes)
                     result.planes[name] = analyzer.spectrum_2d(
                         stokes, middle, self.uv_range, self.taper_space, redshift=self.redshift
                     )
@@ -208,7 +224,7 @@ class CubeAnalysis(Component):
                 result.windows[name] = Analyzer(one).eor_window(
                     Signal21cm.table(self.signal), "I", noise, None if self.wedge is None else self.wedge * u.rad,
                     taper=self.taper, taper_space=self.taper_space, uv_range=self.uv_range, bins=self.bins,
-                    infill=self._infill(), redshift=self.redshift,
+                    bins_par=10 if len(one.freq_hz) >= 8 else None, infill=self._infill(), redshift=self.redshift,
                 )  # fmt: skip
 
     def _infill(self) -> Any:
@@ -217,113 +233,21 @@ class CubeAnalysis(Component):
         return None if self.infill is None else self.infill * u.s
 
 
-@dataclass
-class CubeResults:
-    """What was made of a cube: spectra by name, windows, Faraday cube, what was left out and why, seconds."""
-
-    settings: CubeAnalysis
-    cube: StokesCube
-    faraday: FaradayCube | None = None
-    peaks: FaradayPeaks | None = None
-    brightest: tuple[int, ...] = ()
-    lines: dict[str, FaradayCube] = field(default_factory=dict)
-    split: Split | None = None
-    said: str = ""
-    planes: dict[str, Spectrum2D] = field(default_factory=dict)
-    cylinders: dict[str, Cylindrical] = field(default_factory=dict)
-    spheres: dict[str, Spherical] = field(default_factory=dict)
-    windows: dict[str, EoRWindow] = field(default_factory=dict)
-    left_out: dict[str, str] = field(default_factory=dict)
-    checks: dict[str, CubeCheck] = field(default_factory=dict)
-    warned: list[str] = field(default_factory=list)
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def timed(self, stage: str) -> Iterator[None]:
-        """Adds the wall time of what is inside to a stage."""
-        begin = time.perf_counter()
-        yield
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - begin
-
-    @property
-    def passed(self) -> bool:
-        """Whether every check held, and the removal, if there is one, converged and did not make it worse."""
-        checked = all(check.passed for check in self.checks.values())
-        return checked and (self.split is None or self.removal_passed)
-
-    @property
-    def removal_passed(self) -> bool:
-        """Whether the removal converged and, as far as its score is known, did not make it worse."""
-        assert self.split is not None
-        if self.split.outcome is not Outcome.CONVERGED:
-            return False
-        try:
-            return not self.split.score().worse
-        except InputError:  # too few channels or pixels for a score: said in the text
-            return True
-
-    def lines_of_text(self) -> list[str]:
-        """What matters, for the terminal."""
-        shape = self.cube.data.shape
-        low, high = self.cube.freq_hz.min() / 1e6, self.cube.freq_hz.max() / 1e6
-        out = [f"cube          {shape[0]} channels {low:.6g} to {high:.6g} MHz, {shape[3]} x {shape[2]} pixels, "
-               f"{self.cube.unit}"]  # fmt: skip
-        out += [f"left out      {name}: {why}" for name, why in self.left_out.items()]
-        if self.faraday is not None and self.peaks is not None:
-            found = int(self.peaks.significant.sum())
-            out.append(f"Faraday       {self.faraday.band}")
-            out.append(f"peaks         {found} pixels above {self.peaks.snr_min:g} times the noise")
-        out += [f"{'removal' if k == 0 else '':<14}{line}" for k, line in enumerate(self.said.splitlines())]
-        out += [f"check         {name}: {check}" for name, check in self.checks.items()]
-        for name, window in self.windows.items():
-            out += ["", f"{name or 'as it is'}:", *str(window).splitlines()]
-        return out
-
-    def record(self) -> dict[str, Any]:
-        """What `run.json` holds of it."""
-        out: dict[str, Any] = {"settings": self.settings.to_dict(), "left_out": self.left_out, "warnings": self.warned}
-        if self.faraday is not None and self.peaks is not None:
-            band = self.faraday.band
-            names = ("width", "fwhm", "fwhm_nominal", "fwhm_sinc", "phi_max", "max_scale")
-            out["faraday"] = {name: float(getattr(band, name)) for name in names}
-            out["faraday"] |= {"lambda2_0": self.faraday.lambda2_0, "significant": int(self.peaks.significant.sum())}
-        if self.split is not None:
-            out["removal"] = {"text": self.said.splitlines(), "outcome": self.split.outcome.name.lower()}
-        out["checks"] = {name: {"outcome": [str(c)], "passed": c.passed} for name, c in self.checks.items()}
-        if self.split is not None:
-            out["checks"]["removal"] = {"outcome": [self.said.splitlines()[-1]], "passed": self.removal_passed}
-        out["stage_errors"] = {
-            stage: str(max(checks, key=lambda c: c.error))
-            for stage, start in (("Faraday depth", "Faraday"), ("3D spectra", "power"))
-            if (checks := [c for name, c in self.checks.items() if name.startswith(start)])
-        }
-        for name, window in self.windows.items():
-            out.setdefault("windows", {})[name or "as it is"] = {
-                "text": str(window).splitlines(),
-                "area": window.area(), "area_removed": window.area(self.settings.removed),
-                "reach": window.reach(), "reach_removed": window.reach(self.settings.removed),
-            }  # fmt: skip
-        return out
-
-    def write(self, folder: Path) -> None:
-        """Tables (ECSV) of every spectrum and window, maps of Faraday peaks; the cubes made, where asked for."""
-        for kind, spectra in (("2d", self.planes), ("cylindrical", self.cylinders), ("spherical", self.spheres)):
-            for name, spectrum in spectra.items():
-                spectrum.write(folder / f"spectrum_{kind}_{name.replace(' ', '_')}.ecsv")
-        for name, window in self.windows.items():
-            window.write(folder / f"window{'_' if name else ''}{name.replace(' ', '_')}.ecsv")
-        if self.peaks is not None and self.faraday is not None:
-            self.peaks.write(folder / "faraday_peaks.fits", self.faraday)
-            if self.settings.cubes:
-                self.faraday.write(folder / "faraday.fits")
-        if self.split is not None and self.settings.cubes:
-            self.split.residual.write(folder / "residual.fits")
-
-
 def stokes_of(cube: StokesCube) -> list[str]:
     """Stokes parameters that a cube has: with data, and not zero everywhere."""
     return [name for k, name in enumerate("IQUV") if any(np.nan_to_num(plane[k]).any() for plane in cube.data)]
 
 
 def _has_beam(cube: StokesCube) -> bool:
-    return cube.psf is not None and bool(np.isfinite(cube.psf.solid_angle_sr).all())
+    """Whether every channel with data has a beam."""
+    if cube.psf is None:
+        return False
+    known = np.isfinite(cube.psf.solid_angle_sr)
+    return all(has or not np.isfinite(planes).any() for has, planes in zip(known, cube.data, strict=True))
+
+
+def _middle(cube: StokesCube, stokes: str) -> int:
+    """The middle one of the channels that have data."""
+    plane = cube.data[:, "IQUV".index(stokes)]
+    there = [k for k in np.argsort(cube.freq_hz, kind="stable") if np.isfinite(plane[k]).any()]
+    return int(there[len(there) // 2])

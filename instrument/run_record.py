@@ -19,7 +19,7 @@ from instrument.analyze.spectra import Spectrum2D
 from instrument.analyze.subtraction import ManyDirectionsResult
 from instrument.analyze.sweep import Sweep
 from instrument.calibration_run import CalibrationResult
-from instrument.cube_analysis import CubeResults
+from instrument.cube_results import CubeResults
 from instrument.doctor import package_version
 from instrument.errors import Outcome
 from instrument.image.cube import StokesCube

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 
-from instrument.errors import InputError
+from instrument.errors import InputError, InstrumentWarning
 from instrument.image.cube import StokesCube
 from instrument.units import Bool, Float, Int
 
@@ -20,8 +22,11 @@ def even_channels(cube: StokesCube, infill: bool) -> tuple[Int, Float, Bool]:
     if step <= 0:
         twice = freq[:-1][steps <= 0][0] / 1e6
         raise InputError(f"two channels at {twice:.6g} MHz: power along the line of sight needs each one once")
-    number = np.round((freq - freq[0]) / step).astype(int)
-    # the finest step may be off by rounding of the file: the whole span is the better ruler
+    # steps are rounded in files: counted one by one, and the whole span is the better ruler
+    step = float(np.median(steps[steps < 1.5 * step]))
+    number = np.append(0, np.cumsum(np.round(steps / step).astype(int)))
+    if number[-1] >= 4 * len(freq):
+        raise InputError(f"{len(freq)} channels lie on {number[-1] + 1} places: regrid them, or take a part of them")
     step = float((freq[-1] - freq[0]) / number[-1])
     off = np.abs(freq - freq[0] - number * step).max() / step
     if off > 0.01:
@@ -54,4 +59,9 @@ def infill_operator(freq_hz: Float, here: Bool, delay_s: float) -> Float:
         raise InputError(f"infill = {delay_s} s must be above 0: the largest delay to fill in, such as 300 * u.ns")
     kernel = np.sinc(2 * delay_s * (freq_hz[:, None] - freq_hz))
     there = kernel[np.ix_(here, here)] + 1e-12 * np.eye(int(here.sum()))
-    return np.asarray(np.linalg.lstsq(there, kernel[np.ix_(here, ~here)], rcond=1e-13)[0].T)
+    found = np.asarray(np.linalg.lstsq(there, kernel[np.ix_(here, ~here)], rcond=1e-13)[0].T)
+    worst = float(np.sqrt((found**2).sum(axis=1)).max())
+    if worst > 2:
+        text = f"filling in makes noise {worst:.2g} times as large in some channel: take a smaller delay, or a part"
+        warnings.warn(f"{text} of the band without wide gaps", InstrumentWarning, stacklevel=5)
+    return found

@@ -41,9 +41,10 @@ def check_faraday(cube: StokesCube, found: FaradayCube, samples: int = 64, seed:
     with np.errstate(invalid="ignore", divide="ignore"):
         wanted = turn @ (weight * np.nan_to_num(p)) / weight.sum(axis=0)
         apart = np.abs(found.data[:, y, x] - wanted).max(axis=0) / np.abs(wanted).max(axis=0)
+        apart = np.where(np.isnan(wanted).any(axis=0) | ~np.abs(wanted).any(axis=0), 0.0, apart)
     # rounding of n products of float32 (or float64) grows as its root at most times a few
     unit = float(np.finfo(found.data.dtype).eps)
-    return CubeCheck(float(np.nanmax(np.nan_to_num(apart), initial=0.0)), 20 * unit, samples)
+    return CubeCheck(float(np.nan_to_num(apart, nan=np.inf).max(initial=0.0)), 20 * unit, samples)
 
 
 def check_cells(cube: StokesCube, cells: Cells, samples: int = 16, seed: int = 0) -> CubeCheck | None:

@@ -11,9 +11,9 @@ from typing import Any, Self
 import numpy as np
 
 from instrument.analyze.cells import Cells, Frame
-from instrument.analyze.fourier import bin_edges, per_mpc
+from instrument.analyze.fourier import bin_edges, per_mpc, sine
 from instrument.errors import InputError
-from instrument.units import Float, Int, to_si
+from instrument.units import Float, Int
 from instrument.whole_file import write_ecsv
 
 
@@ -36,7 +36,7 @@ class _Spectrum(ABC):
 
     def less(self, noise: Self) -> Self:
         """The same less the power of noise (its bias taken off); errors add in squares. Raises for other bins."""
-        _demand_same(self, noise)
+        demand_same(self, noise)
         sigma = np.hypot(self.sigma, noise.sigma)
         found: Self = replace(self, power=self.power - noise.power, sigma=sigma)  # type: ignore[type-var]
         return found
@@ -91,7 +91,7 @@ class Cylindrical(_Spectrum):
 
     def wedge(self, angle: Any) -> Float:
         """k_par (P,) below which smooth sources within `angle` of the phase centre lie; 90 deg is the horizon."""
-        return self.frame.horizon_slope * np.sin(to_si(angle, "rad", "angle")) * self.k_perp
+        return self.frame.horizon_slope * sine(angle) * self.k_perp
 
     def average(self, model: Callable[[Float], Float]) -> Float:
         """Mean of a spectrum P(k) (function of k in 1/Mpc) over the cells of each bin (P, L).
@@ -226,13 +226,10 @@ def cylindrical(
 
 def spherical(cells: Cells, bins: Any = 15, log: bool = True, wedge: Any = None, k_par_min: Any = None) -> Spherical:
     """Cells in bins of k, those of the wedge or of small k_par left out where asked; see `Analyzer.spherical`."""
-    angle = 0.0 if wedge is None else float(to_si(wedge, "rad", "wedge"))
-    least = 0.0 if k_par_min is None else float(per_mpc(k_par_min, "k_par_min"))
-    if not (0 <= angle <= np.pi / 2 + 1e-9 and 0 <= least < cells.k_par[-1]):
-        raise InputError(
-            f"wedge = {wedge}, k_par_min = {k_par_min}: needed 0 to 90 deg, and 0 to {cells.k_par[-1]:.3g} /Mpc"
-        )
-    slope = cells.frame.horizon_slope * np.sin(angle)
+    slope = cells.frame.horizon_slope * sine(wedge)
+    least = float(per_mpc(0.0 if k_par_min is None else k_par_min, "k_par_min"))
+    if not 0 <= least < cells.k_par[-1]:
+        raise InputError(f"k_par_min = {k_par_min} is not within 0 to {cells.k_par[-1]:.3g} /Mpc")
     # of every delay, the cells (u, v) that are above the wedge: the first so many
     ends = np.where(cells.k_par < least, 0, np.searchsorted(cells.k_perp * slope, cells.k_par, "right"))
     first = cells.k_perp[: np.searchsorted(cells.k_perp, 0.0, "right") + 1]
@@ -274,11 +271,12 @@ def _length(k_perp: Any, k_par: Any) -> Float:
 
 def ratio(a: Cylindrical, b: Cylindrical) -> Float:
     """Power of `a` over that of `b` (P, L): the PSF cancels. NaN where a bin is empty or `b` is not above 0."""
-    _demand_same(a, b)
+    demand_same(a, b)
     return np.divide(a.power, b.power, out=np.full(a.power.shape, np.nan), where=b.power > 0)
 
 
-def _demand_same(a: _Spectrum, b: _Spectrum) -> None:
+def demand_same(a: _Spectrum, b: _Spectrum) -> None:
+    """Raise `InputError` unless two spectra have the same bins and unit."""
     pairs = list(zip(a.edges_of(), b.edges_of(), strict=False))
     same = a.unit == b.unit and all(x.shape == y.shape and np.allclose(x, y, rtol=1e-9, atol=0) for x, y in pairs)
     if not same:
@@ -288,6 +286,8 @@ def _demand_same(a: _Spectrum, b: _Spectrum) -> None:
 def _edges(k: Float, bins: Any, log: bool, frame: Frame | None = None) -> Float:
     """Edges over the range of k, or of the cut of baselines; from the first k above 0 in log bins."""
     above = k[k > 0]
+    if not above.size:
+        raise InputError("an image of one pixel has no k_perp above 0: there is nothing to bin")
     low, high = float(above.min()) if log else float(k.min()), float(k.max())
     if frame is not None and frame.uv_range is not None:
         per_mpc = 2 * np.pi / frame.distance_mpc

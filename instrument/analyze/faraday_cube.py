@@ -102,9 +102,10 @@ class FaradayCube:
         outer = np.argsort(-np.abs(self.depths), kind="stable")[: max(1, len(self.depths) // 5)]
         step = max(1, len(outer) * self.data[0].size // 2_000_000)  # 2e6 values give 0.1 %
         values = np.concatenate([np.abs(self.data[k].reshape(-1)[::step]) for k in outer])
-        if not np.isfinite(values).any():
+        values = values[values > 0]  # spectra of zeros are no data; NaN is not above 0 either
+        if not values.size:
             return np.nan
-        return float(np.nanmedian(values) / np.sqrt(2 * np.log(2)))
+        return float(np.median(values) / np.sqrt(2 * np.log(2)))
 
     def rmsf_at(self, depths: Any) -> Complex:
         """R(phi) at depths in rad/m², of pixels without flags; the shape of the depths."""

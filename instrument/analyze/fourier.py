@@ -100,6 +100,14 @@ def per_mpc(k: Any, name: str = "k") -> Float:
     return np.asarray(k if getattr(k, "unit", None) is None else to_si(k, "1/Mpc", name), float)
 
 
+def sine(wedge: Any) -> float:
+    """Sine of an angle from the phase centre, 0 for None; raises `InputError` unless it is 0 to 90 deg."""
+    angle = 0.0 if wedge is None else float(to_si(wedge, "rad", "wedge"))
+    if not 0 <= angle <= np.pi / 2 + 1e-9:
+        raise InputError(f"wedge = {wedge} is not within 0 to 90 deg")
+    return float(np.sin(angle))
+
+
 def bin_edges(low: float, high: float, bins: Any, log: bool) -> Float:
     """Edges in 1/Mpc (N + 1,): `bins` of them, equal in ln k or in k, or the edges given with their unit."""
     if isinstance(bins, int | np.integer):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from instrument.analyze.cylinders import Cylindrical
+from instrument.analyze.cylinders import Cylindrical, demand_same
 from instrument.analyze.fourier import per_mpc
 from instrument.analyze.signal import Signal21cm
 from instrument.errors import InputError
@@ -109,10 +109,11 @@ class EoRWindow:
             what = f"{removed:.0%} of the leakage removed" if removed else "leakage as it is"
             lines.append(f"{what:<28} {share:4.0%} of the bins' area ({area:.2f} in ln k ln k), {run}")
         top = float(min(1.0, self.leakage.k_par[-1]))
-        needed = self.removal_needed(top) if (self.counts & (self.leakage.k_par <= top)).any() else np.nan
-        said = (
-            "cannot be done: noise is above the signal" if np.isnan(needed) else f"remove {needed:.0%} of the leakage"
-        )
+        said = "no bin counts: all are in the wedge, empty or outside the model"
+        if (self.counts & (self.leakage.k_par <= top)).any():
+            needed = self.removal_needed(top)
+            said = f"remove {needed:.0%} of the leakage"
+            said = "cannot be done: noise is above the signal" if np.isnan(needed) else said
         lines.append(f"to open it up to k_par = {top:.2g}   {said}")
         return "\n".join(lines)
 
@@ -143,10 +144,13 @@ def eor_window(
     """The window left by a spectrum of leakage in K; see `Analyzer.eor_window`."""
     if leakage.unit != "K":
         raise InputError(f"the spectrum is in {leakage.unit}, the signal in K: take the spectrum of cube.to_kelvin()")
-    if noise is not None and noise.power.shape != leakage.power.shape:
-        raise InputError("the spectra of noise and leakage have other bins: make both with the same settings")
+    if noise is not None:
+        demand_same(leakage, noise)
+    least = float(per_mpc(k_par_min, "k_par_min"))
+    if not least >= 0:
+        raise InputError(f"k_par_min = {k_par_min} must be 0 /Mpc or more")
     line = np.zeros(len(leakage.k_perp)) if wedge is None else leakage.wedge(wedge)
-    below = (leakage.k_par < np.nan_to_num(line)[:, None]) | (leakage.k_par < per_mpc(k_par_min, "k_par_min"))
+    below = (leakage.k_par < np.nan_to_num(line)[:, None]) | (leakage.k_par < least)
     power = leakage.average(signal.power_or_nan)
     flat = np.zeros(leakage.power.shape) if noise is None else noise.power
     return EoRWindow(leakage, power, flat, below, signal)

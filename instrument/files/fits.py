@@ -97,7 +97,7 @@ def _look(path: Path, names: list[str] | None, unit: Unit | None, named: bool) -
     except FileNotFoundError:
         raise FileError(f"{path} does not exist") from None
     except (*BROKEN, fits.VerifyError) as error:
-        raise FileError(f"{path.name} is not a readable FITS file: {one_line(error)}") from None
+        raise FileError(f"{path.name or path} is not a readable FITS file: {one_line(error)}") from None
     raise FileError(f"{path.name}: there is no image of two axes or more in it")
 
 

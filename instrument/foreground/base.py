@@ -208,6 +208,8 @@ class Split:
             if truth.shape != (len(clean.empty), *clean.good.shape):
                 raise InputError(f"the true foreground has shape {truth.shape}, the plane of the cube another")
             truth = np.where(clean.good, truth[clean.channels], 0.0)
+            if not np.isfinite(truth).all():
+                raise InputError("the true foreground is not finite where the cube has data")
             return true_score(truth, self._maps, clean.freq_hz, pixel, *options)
         key = (*options, seed)
         if key not in self._scores:

@@ -99,6 +99,8 @@ def signal_loss(
         )
     if not np.allclose(signal.freq_hz, cube.freq_hz, rtol=1e-9, atol=0):
         raise InputError("the signal has other channels than the cube")
+    if not np.isclose(signal.pixel_rad, cube.pixel_rad, rtol=1e-9, atol=0):
+        raise InputError("the signal has pixels of another size than the cube")
     s = "IQUV".index(remover.stokes)
     if not np.isfinite(signal.data[:, s]).all() or not signal.data[:, s].any():
         raise InputError(f"{remover.stokes} of the signal is not finite everywhere, or zero everywhere")

@@ -214,6 +214,8 @@ def _draw(noise: Float, shape: Float, maps: Any, seed: int) -> Any:
     _, ny, nx = maps.shape
     amplitude = (np.sqrt(noise) / np.sqrt(ny * nx)).astype(maps.dtype)  # white noise of variance 1: |DFT|^2 = ny nx
     hole = ~maps.any(axis=0)
+    # `noise` was seen through the holes, which take their share of it; the draw goes through them once more
+    amplitude /= maps.dtype.type(np.sqrt(1 - hole.mean()))
     for image, s in zip(out, np.sqrt(shape), strict=True):
         cells = fft.r2c(rng.standard_normal((ny, nx), dtype=maps.dtype), nthreads=0) * (amplitude * maps.dtype.type(s))
         image[...] = fft.c2r(cells, lastsize=nx, forward=False, inorm=2, nthreads=0)

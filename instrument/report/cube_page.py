@@ -11,7 +11,7 @@ import numpy as np
 from instrument.analyze.faraday_cube import FaradayCube
 from instrument.analyze.ixr import removal_table
 from instrument.analyze.signal import Signal21cm
-from instrument.cube_analysis import CubeResults
+from instrument.cube_results import CubeResults
 from instrument.report.cylinders import cylinder, cylinder_ratio, spheres
 from instrument.report.page import Block, FigureEntry, Figures, Section, Table, Text, number
 from instrument.report.spectra import spectra_2d
@@ -89,8 +89,9 @@ def _faraday(result: CubeResults, figure: Draw) -> Section | None:
 
 def _brightest(found: FaradayCube) -> Float:
     """Six depths over the range in which most of the emission lies."""
-    power = np.array([np.nanmean(np.abs(plane) ** 2) for plane in found.data])
+    power = np.array([np.nanmean(np.abs(plane.astype(complex)) ** 2) for plane in found.data])
     bright = found.depths[np.nan_to_num(power) >= 0.2 * np.nanmax(power)]
+    bright = bright if bright.size else found.depths
     middle, half = (bright.max() + bright.min()) / 2, max(np.ptp(bright) / 2, 1.25 * min(found.fwhm, 1e6))
     return np.linspace(max(middle - half, found.depths.min()), min(middle + half, found.depths.max()), 6)
 

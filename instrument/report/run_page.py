@@ -12,7 +12,7 @@ from instrument.analyze.subtraction import ManyDirectionsResult
 from instrument.analyze.sweep import Sweep
 from instrument.calibrate.base import Solution
 from instrument.calibrate.di_errors import DIComparison
-from instrument.cube_analysis import CubeResults
+from instrument.cube_results import CubeResults
 from instrument.image.cube import StokesCube
 from instrument.report.calibration import convergence, gains, residuals
 from instrument.report.cube_page import cube_sections

@@ -37,6 +37,7 @@ LAYERS = (
     ("image",),
     ("analyze",),
     ("foreground",),
+    ("cube_results",),
     ("cube_analysis",),
     ("files",),
     ("report",),

@@ -1,0 +1,123 @@
+"""What was made of a cube: spectra, Faraday cube, windows, checks, and what is written of them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from instrument.analyze.cube_checks import CubeCheck
+from instrument.analyze.cylinders import Cylindrical, Spherical
+from instrument.analyze.faraday_cube import FaradayCube
+from instrument.analyze.faraday_peaks import FaradayPeaks
+from instrument.analyze.spectra import Spectrum2D
+from instrument.analyze.window import EoRWindow
+from instrument.errors import InputError, Outcome
+from instrument.foreground.base import Split
+from instrument.image.cube import StokesCube
+
+
+@dataclass
+class CubeResults:
+    """What was made of a cube: spectra by name, windows, Faraday cube, what was left out and why, seconds."""
+
+    settings: Any  # the `CubeAnalysis` that made it
+    cube: StokesCube
+    faraday: FaradayCube | None = None
+    peaks: FaradayPeaks | None = None
+    brightest: tuple[int, ...] = ()
+    lines: dict[str, FaradayCube] = field(default_factory=dict)
+    split: Split | None = None
+    said: str = ""
+    planes: dict[str, Spectrum2D] = field(default_factory=dict)
+    cylinders: dict[str, Cylindrical] = field(default_factory=dict)
+    spheres: dict[str, Spherical] = field(default_factory=dict)
+    windows: dict[str, EoRWindow] = field(default_factory=dict)
+    left_out: dict[str, str] = field(default_factory=dict)
+    checks: dict[str, CubeCheck] = field(default_factory=dict)
+    warned: list[str] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Adds the wall time of what is inside to a stage."""
+        begin = time.perf_counter()
+        yield
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - begin
+
+    @property
+    def passed(self) -> bool:
+        """Whether every check held, and the removal, if there is one, converged and did not make it worse."""
+        checked = all(check.passed for check in self.checks.values())
+        return checked and (self.split is None or self.removal_passed)
+
+    @property
+    def removal_passed(self) -> bool:
+        """Whether the removal converged and, as far as its score is known, did not make it worse."""
+        assert self.split is not None
+        if self.split.outcome is not Outcome.CONVERGED:
+            return False
+        try:
+            return not self.split.score().worse
+        except InputError:  # too few channels or pixels for a score: said in the text
+            return True
+
+    def lines_of_text(self) -> list[str]:
+        """What matters, for the terminal."""
+        shape = self.cube.data.shape
+        low, high = self.cube.freq_hz.min() / 1e6, self.cube.freq_hz.max() / 1e6
+        out = [f"cube          {shape[0]} channels {low:.6g} to {high:.6g} MHz, {shape[3]} x {shape[2]} pixels, "
+               f"{self.cube.unit}"]  # fmt: skip
+        out += [f"left out      {name}: {why}" for name, why in self.left_out.items()]
+        if self.faraday is not None and self.peaks is not None:
+            found = int(self.peaks.significant.sum())
+            out.append(f"Faraday       {self.faraday.band}")
+            out.append(f"peaks         {found} pixels above {self.peaks.snr_min:g} times the noise")
+        out += [f"{'removal' if k == 0 else '':<14}{line}" for k, line in enumerate(self.said.splitlines())]
+        out += [f"check         {name}: {check}" for name, check in self.checks.items()]
+        for name, window in self.windows.items():
+            out += ["", f"{name or 'as it is'}:", *str(window).splitlines()]
+        return out
+
+    def record(self) -> dict[str, Any]:
+        """What `run.json` holds of it."""
+        out: dict[str, Any] = {"settings": self.settings.to_dict(), "left_out": self.left_out, "warnings": self.warned}
+        if self.faraday is not None and self.peaks is not None:
+            band = self.faraday.band
+            names = ("width", "fwhm", "fwhm_nominal", "fwhm_sinc", "phi_max", "max_scale")
+            out["faraday"] = {name: float(getattr(band, name)) for name in names}
+            out["faraday"] |= {"lambda2_0": self.faraday.lambda2_0, "significant": int(self.peaks.significant.sum())}
+        if self.split is not None:
+            out["removal"] = {"text": self.said.splitlines(), "outcome": self.split.outcome.name.lower()}
+        out["checks"] = {name: {"outcome": [str(c)], "passed": c.passed} for name, c in self.checks.items()}
+        if self.split is not None:
+            out["checks"]["removal"] = {"outcome": [self.said.splitlines()[-1]], "passed": self.removal_passed}
+        out["stage_errors"] = {
+            stage: str(max(checks, key=lambda c: c.error))
+            for stage, start in (("Faraday depth", "Faraday"), ("3D spectra", "power"))
+            if (checks := [c for name, c in self.checks.items() if name.startswith(start)])
+        }
+        for name, window in self.windows.items():
+            out.setdefault("windows", {})[name or "as it is"] = {
+                "text": str(window).splitlines(),
+                "area": window.area(), "area_removed": window.area(self.settings.removed),
+                "reach": window.reach(), "reach_removed": window.reach(self.settings.removed),
+            }  # fmt: skip
+        return out
+
+    def write(self, folder: Path) -> None:
+        """Tables (ECSV) of every spectrum and window, maps of Faraday peaks; the cubes made, where asked for."""
+        for kind, spectra in (("2d", self.planes), ("cylindrical", self.cylinders), ("spherical", self.spheres)):
+            for name, spectrum in spectra.items():
+                spectrum.write(folder / f"spectrum_{kind}_{name.replace(' ', '_')}.ecsv")
+        for name, window in self.windows.items():
+            window.write(folder / f"window{'_' if name else ''}{name.replace(' ', '_')}.ecsv")
+        if self.peaks is not None and self.faraday is not None:
+            self.peaks.write(folder / "faraday_peaks.fits", self.faraday)
+            if self.settings.cubes:
+                self.faraday.write(folder / "faraday.fits")
+        if self.split is not None and self.settings.cubes:
+            self.split.residual.write(folder / "residual.fits")
