@@ -82,7 +82,7 @@ def main():
 
 {date.today()}, {os.cpu_count()} cores ({platform.machine()}), Python {platform.python_version()},
 numpy {version("numpy")}, numba {version("numba")}, instrument {version("instrument")}.
-Made by `python docs/reports/foregrounds.py --pixels {given.pixels}`.
+Made by `python docs/reports/foregrounds.py --pixels {given.pixels}{" --gmca4im FOLDER" if given.gmca4im else ""}`.
 
 27 Faraday screens from -1.5 to 5 rad/m^2 leak into Stokes I: 7.1 mK rms, 161 channels of 0.2 MHz from 134 MHz,
 {given.pixels} x {given.pixels} pixels of 0.5', beam 3' at 150 MHz. Four components where there is a number of them.

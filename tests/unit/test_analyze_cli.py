@@ -45,7 +45,7 @@ def run(*words):
 def test_a_cube_gives_everything_it_allows(cube_file, tmp_path, capsys):
     out = tmp_path / "out"
     assert run(cube_file, "--out", out, "--depths", "-20,20,0.5", "--remove", "pca", "--remover", "components=2",
-               "--wedge", "2 deg", "--cubes") in (0, 3)  # fmt: skip
+               "--wedge", "2 deg", "--cubes") == 0  # fmt: skip
     said = capsys.readouterr().out
     assert "Stokes V: no data, or zero everywhere" in said and "EoR window" in said and "after removal" in said
     names = {path.name for path in out.iterdir()}
