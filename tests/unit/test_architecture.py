@@ -23,6 +23,7 @@ HEAVY = {"astropy", "scipy", "numba", "matplotlib", "ducc0", "h5py", "jinja2", "
 LAYERS = (
     ("errors", "data", "scenes", "whole_file"),
     ("units", "run_folder"),
+    ("files_in",),
     ("registry", "mat2", "phasor"),
     ("component",),
     ("observe",),
