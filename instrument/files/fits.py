@@ -54,14 +54,15 @@ def read_cube(
     stokes: str | Sequence[str] | None = None,
     unit: Unit | None = None,
     frequencies: Any = None,
+    psf: Psf | None = None,
 ) -> StokesCube:
     """Cube (F, 4, Ny, Nx) of FITS images, float32 (float64 where a file is), NaN for Stokes parameters that none has.
 
     Axes RA, DEC, FREQ and STOKES are found by CTYPE, in any order; FREQ is linear in Hz, kHz, MHz or GHz, or a column
     FREQ of a table BEAMS. Files are put together by Stokes parameter, and along frequency in the order given. `stokes`
-    ("Q,U"), `unit` and `frequencies` (with a unit) stand for what the headers do not say, or say wrongly. Beams come
-    from the table BEAMS (CASA's, ours) or BMAJ, BMIN, BPA. x is turned to run west, y north; U of POLCCONV = 'COSMO'
-    changes sign. Raises `FileError` or `InputError` in one line with file, axis or keyword, value and remedy.
+    ("Q,U"), `unit`, `frequencies` (with a unit) and `psf` stand for what the headers do not say, or say wrongly. Beams
+    come from the table BEAMS (CASA's, ours) or BMAJ, BMIN, BPA. x is turned to run west, y north; U of POLCCONV =
+    'COSMO' changes sign. Raises `FileError` or `InputError` in one line with file, axis or keyword, value and remedy.
     """
     if not paths:
         raise InputError('read_cube needs a file: read_cube("cube.fits"), or one for each Stokes parameter')
@@ -79,7 +80,7 @@ def read_cube(
         raise InputError(f"stokes = {stokes!r} names {len(names)} more than the files have planes: {', '.join(names)}")
     _same(parts)
     places, freq = _places(parts, freq)
-    return _filled(parts, places, freq)
+    return _filled(parts, places, freq, psf)
 
 
 def _look(path: Path, names: list[str] | None, unit: Unit | None, named: bool) -> _Part:
@@ -259,7 +260,7 @@ def _data(part: _Part) -> Iterator[Any]:
         raise FileError(f"{part.name}: its data cannot be read: {one_line(error)}") from None
 
 
-def _filled(parts: list[_Part], places: Places, freq: Float) -> StokesCube:
+def _filled(parts: list[_Part], places: Places, freq: Float, psf: Psf | None) -> StokesCube:
     from astropy import units as u
 
     first = parts[0]
@@ -279,10 +280,11 @@ def _filled(parts: list[_Part], places: Places, freq: Float) -> StokesCube:
                     out[here, k] *= factor
                 beams[k, :, here] = part.beams
     of = [beams[NAMES.index(name)] for name in places]
-    if any(not np.allclose(b[:2], of[0][:2], rtol=1e-3, atol=0, equal_nan=True) for b in of[1:]):
+    if psf is None and any(not np.allclose(b[:2], of[0][:2], rtol=1e-3, atol=0, equal_nan=True) for b in of[1:]):
         said = f"beams differ between Stokes parameters: those of {next(iter(places))} are taken"
         warnings.warn(said, InstrumentWarning, stacklevel=3)
     major, minor, angle = of[0]
-    psf = Psf.gaussian(major * u.rad, minor * u.rad, angle * u.rad) if np.isfinite(major).any() else None
+    if psf is None and np.isfinite(major).any():
+        psf = Psf.gaussian(major * u.rad, minor * u.rad, angle * u.rad)
     grid = first.grid
     return StokesCube(out, freq * u.Hz, grid.pixel_rad * u.rad, first.unit, grid.centre, psf)

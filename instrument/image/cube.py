@@ -9,6 +9,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from instrument.errors import InputError
+from instrument.image.channels import channel_index, in_band
 from instrument.observe.directions import LIGHT
 from instrument.units import Direction, Float, to_si
 from instrument.whole_file import whole_file
@@ -156,12 +157,29 @@ class StokesCube:
 
     def channels(self, keep: Any) -> StokesCube:
         """Some of the channels: indices in the order wanted, a slice, or (F,) booleans."""
-        index = np.atleast_1d(np.arange(len(self.data))[keep])
+        index = channel_index(keep, len(self.data))
+        if not len(index):
+            raise InputError("no channel is chosen: a cube has at least one")
         psf = self.psf and Psf(
             None if self.psf.data is None else self.psf.data[index],
             *(x[index] for x in (self.psf.major_rad, self.psf.minor_rad, self.psf.angle_rad, self.psf.residual)),
         )
         return self._with(data=self.data[index], freq_hz=self.freq_hz[index], psf=psf)
+
+    def select(self, channels: Any = None, band: Any = None) -> StokesCube:
+        """Some of the channels, as `channels` takes them, and of these what lies in `band`, both ends included.
+
+        `band` is two frequencies with their unit, or text: "134 MHz,166 MHz".
+        """
+        chosen = self if channels is None else self.channels(channels)
+        return chosen if band is None else chosen.channels(in_band(chosen.freq_hz, band))
+
+    def flagged(self, channels: Any) -> StokesCube:
+        """The same without data (NaN) in some channels: indices, a slice, or (F,) booleans."""
+        index = channel_index(channels, len(self.data))
+        data = np.array(self.data, np.result_type(self.data, np.float32))
+        data[index] = np.nan
+        return self._with(data=data)
 
     def sorted(self) -> StokesCube:
         """The channels in order of frequency, low to high; the cube itself where they are."""
