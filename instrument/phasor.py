@@ -13,6 +13,7 @@ from typing import Any
 import numba
 import numpy as np
 
+from instrument.compiled import compiled
 from instrument.units import Complex, Float
 
 FAST = {"contract", "nsz", "nnan", "ninf"}  # no reassociation: sums keep their order, so results repeat
@@ -42,7 +43,7 @@ def cis(cycles: float) -> Any:
     return cosine, sine
 
 
-@numba.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+@compiled(nogil=True, fastmath=FAST, error_model="numpy")
 def _array_factor(waves: Any, offsets: Any, out: Any) -> None:
     rows, _, count = waves.shape
     units, parts, _ = offsets.shape
@@ -79,7 +80,7 @@ def array_factor_reference(waves: Float, offsets_m: Float) -> Complex:
     return np.asarray(np.exp(2j * np.pi * np.einsum("ncs,umc->nums", waves, offsets_m)).mean(axis=2))
 
 
-@numba.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+@compiled(nogil=True, fastmath=FAST, error_model="numpy")
 def _station_phases(uvw: Any, lmn: Any, out: Any) -> None:
     rows, stations, _ = uvw.shape
     count = lmn.shape[1]

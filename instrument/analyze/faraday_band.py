@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 
 from instrument.analyze.fourier import comoving, line_of_sight
+from instrument.compiled import compiled
 from instrument.errors import InputError
 from instrument.observe.directions import LIGHT
 from instrument.phasor import cis
@@ -36,7 +36,7 @@ def one(value: Any, unit: str, name: str) -> float:
     return float(found.reshape(()))
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@compiled(nogil=True, error_model="numpy")
 def half_height(lambda2: Any, weights: Any) -> float:
     """Smallest depth where |R(phi)| = |sum w exp(-2i phi l2)| / sum w is 1/2; inf where it stays above."""
     total, mean, low, high = 0.0, 0.0, np.inf, -np.inf

@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-import numba
 import numpy as np
 
 from instrument.analyze.faraday_band import half_height, one
 from instrument.analyze.faraday_chunks import in_threads
 from instrument.analyze.faraday_cube import FaradayCube
+from instrument.compiled import compiled
 from instrument.errors import InputError, InstrumentError, Outcome
 from instrument.phasor import FAST
 from instrument.units import Complex, Float, Int
@@ -74,7 +74,7 @@ class FaradayClean:
             raise InstrumentError(f"{count} of {self.codes.size} spectra did not converge: {outcome.value}")
 
 
-@numba.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+@compiled(nogil=True, fastmath=FAST, error_model="numpy")
 def _subtract(re: Any, im: Any, power: Any, bits: Any, c: Any, tre: Any, tim: Any, k: int, n: int) -> Any:
     """Take c R(i - k) off one spectrum of n depths, padded; the place of the largest |.|² left.
 
@@ -98,7 +98,7 @@ def _subtract(re: Any, im: Any, power: Any, bits: Any, c: Any, tre: Any, tim: An
     return place
 
 
-@numba.njit(nogil=True, fastmath={"contract"}, error_model="numpy", cache=True)
+@compiled(nogil=True, fastmath={"contract"}, error_model="numpy")
 def _clean(
     data: Any, first: int, pattern: Any, tre: Any, tim: Any, beam: Any, cutoff: Any, gain: float, limit: int,
     held: Any, bits: Any, components: Any, residual: Any, restored: Any, iterations: Any, codes: Any,

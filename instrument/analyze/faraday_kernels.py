@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 
+from instrument.compiled import compiled
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+
+@compiled(nogil=True, error_model="numpy")
 def gather(cube: Any, a: int, b: int, channels: Any, first: int, limit: float, x: Any) -> int:
     """Planes a and b of a cube (F, 4, Ny, Nx) as x (N, 2, n), pixels from `first` on; returns how many are flagged.
 
@@ -35,7 +36,7 @@ def gather(cube: Any, a: int, b: int, channels: Any, first: int, limit: float, x
     return bad
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@compiled(nogil=True, error_model="numpy")
 def mark(cube: Any, a: int, b: int, channels: Any, first: int, limit: float, good: Any) -> int:
     """Which voxels have data, good (N, n); returns the first channel with an absolute value above `limit`, or -1."""
     nx, infinite = cube.shape[3], -1
@@ -49,7 +50,7 @@ def mark(cube: Any, a: int, b: int, channels: Any, first: int, limit: float, goo
     return infinite
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@compiled(nogil=True, error_model="numpy")
 def divide(cube: Any, channels: Any, first: int, weights: Any, offset: Any, good: Any, x: Any, level: Any) -> None:
     """Divide x (N, 2, n) by Stokes I of the cube, take voxels without I > 0 out of `good`; I at offset 0 as level (n,).
 
@@ -81,7 +82,7 @@ def divide(cube: Any, channels: Any, first: int, weights: Any, offset: Any, good
             level[i] = np.exp(t0 / s0)
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@compiled(nogil=True, error_model="numpy")
 def combine(g: Any, index: Any, sign: Any, factor: Any, first: int, out: Any) -> None:
     """F of Q + iU at all depths from g (2, M, 2, n): rows cos and sin of M |phi|, columns Q and U; times factor (n,).
 
@@ -95,7 +96,7 @@ def combine(g: Any, index: Any, sign: Any, factor: Any, first: int, out: Any) ->
             out[k, first + i] = complex(re * factor[i], im * factor[i])
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@compiled(nogil=True, error_model="numpy")
 def combine_real(g: Any, index: Any, sign: Any, factor: Any, first: int, out: Any) -> None:
     """F of a real Stokes parameter from g (2, M, 1, n): F(-phi) is the conjugate of F(phi)."""
     for k in range(len(index)):
@@ -104,7 +105,7 @@ def combine_real(g: Any, index: Any, sign: Any, factor: Any, first: int, out: An
             out[k, first + i] = complex(g[0, r, 0, i] * factor[i], -s * g[1, r, 0, i] * factor[i])
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@compiled(nogil=True, error_model="numpy")
 def brightest(data: Any, order: Any, first: int, power: Any, place: Any) -> None:
     """Largest |F|² (n,) over depths and its place in `order`, of pixels from `first` on; -1 where none is a number."""
     power[:] = -1.0
@@ -119,7 +120,7 @@ def brightest(data: Any, order: Any, first: int, power: Any, place: Any) -> None
                 place[i] = k
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@compiled(nogil=True, error_model="numpy")
 def has_data(cube: Any, a: int, b: int) -> Any:
     """Which channels (F,) have a voxel with data in planes a and b; looks no further than the first."""
     out = np.zeros(cube.shape[0], np.bool_)

@@ -11,6 +11,7 @@ from typing import Any
 import numba
 import numpy as np
 
+from instrument.compiled import compiled
 from instrument.phasor import FAST
 from instrument.units import Float, Int
 
@@ -46,7 +47,7 @@ def _at(x: Any, i: int, lane: int) -> Any:
     )  # fmt: skip
 
 
-@numba.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+@compiled(nogil=True, fastmath=FAST, error_model="numpy")
 def sweep(data: Any, model: Any, a1: Any, a2: Any, jones: Any, right: Any, left: Any) -> None:
     """Sums of one sweep: right (A, 8, L) = sum V Z^H, left (A, 4, L) = sum Z Z^H as (00, 11, re 01, im 01).
 
@@ -78,7 +79,7 @@ def sweep(data: Any, model: Any, a1: Any, a2: Any, jones: Any, right: Any, left:
             left[q, 3, lane] += z[1] * z[4] - z[0] * z[5] + z[3] * z[6] - z[2] * z[7]
 
 
-@numba.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+@compiled(nogil=True, fastmath=FAST, error_model="numpy")
 def residual(data: Any, model: Any, a1: Any, a2: Any, jones: Any, out: Any) -> None:
     """Power of V - J_a M J_b^H and of V in each lane, (2, L)."""
     out[:] = 0.0

@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba
 import numpy as np
 
 from instrument import mat2
+from instrument.compiled import compiled
 from instrument.jones.chain import Factors
 from instrument.observe.directions import LIGHT
 from instrument.phasor import FAST, station_phases
@@ -191,7 +191,7 @@ def _gaussian_sums(
     )
 
 
-@numba.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+@compiled(nogil=True, fastmath=FAST, error_model="numpy")
 def _envelope_sum(left: Any, right: Any, uvw: Any, axes: Any, a1: Any, a2: Any, out: Any) -> None:
     scale = -2.0 * math.pi**2
     for n in range(left.shape[0]):

@@ -6,8 +6,9 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
+
+from instrument.compiled import compiled
 
 from instrument.errors import Outcome
 from instrument.foreground.linear import one_thread, pinv, principal
@@ -29,7 +30,7 @@ class Found(NamedTuple):
     outcome: Outcome
 
 
-@numba.njit(nogil=True, cache=True, fastmath=True)
+@compiled(nogil=True, fastmath=True)
 def _step(data: Any, unmix: Any, limit: Any, soft: bool, first: int, last: int, across: Any, gram: Any) -> None:
     """Sums of D S^T (rows, n) and S S^T (n, n) over the coefficients first <= p < last, S = threshold(unmix D)."""
     rows, n = data.shape[0], unmix.shape[0]

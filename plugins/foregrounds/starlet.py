@@ -11,8 +11,9 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import numba
 import numpy as np
+
+from instrument.compiled import compiled
 
 from instrument.units import Float
 
@@ -21,7 +22,7 @@ GAINS = (0.890796, 0.200664, 0.085508, 0.041217, 0.020425, 0.010190, 0.005092, 0
 SMOOTH = (0.273438, 0.123474, 0.060359, 0.030015, 0.014987, 0.007491, 0.003745, 0.001873)
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled(nogil=True)
 def _mirror(i: int, n: int) -> int:
     """Index of a mirrored axis: ... 2 1 0 1 2 ... n-2 n-1 n-2 ..."""
     if n == 1:
@@ -30,7 +31,7 @@ def _mirror(i: int, n: int) -> int:
     return i if i < n else 2 * n - 2 - i
 
 
-@numba.njit(nogil=True, cache=True, fastmath=True)
+@compiled(nogil=True, fastmath=True)
 def _smooth(source: Any, rows: Any, out: Any, step: int) -> None:
     ny, nx = source.shape
     a, b, c = source.dtype.type(0.0625), source.dtype.type(0.25), source.dtype.type(0.375)
@@ -51,7 +52,7 @@ def _smooth(source: Any, rows: Any, out: Any, step: int) -> None:
                 out[y, x] = a * far + b * near + c * row[x]
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled(nogil=True)
 def _starlet(image: Any, details: Any, last: Any) -> None:
     rows, smooth = np.empty_like(image), np.empty_like(image)
     last[:] = image
