@@ -88,7 +88,7 @@ def _sound(name: str, content: bytes) -> bytes:
     return content
 
 
-class _Cache(FunctionCache):  # type: ignore[misc]
+class _Cache(FunctionCache):
     """A cache of one function that never stops it."""
 
     def __init__(self, function: Callable[..., Any]) -> None:

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from instrument.compiled import compiled
-
 from instrument.errors import Outcome
 from instrument.foreground.linear import one_thread, pinv, principal
 from instrument.units import Float

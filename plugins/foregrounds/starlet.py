@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from instrument.compiled import compiled
-
 from instrument.units import Float
 
 # rms of w_j, and of c_{j+1}, of white noise of rms 1 in two dimensions far from edges: means of the squared transfer

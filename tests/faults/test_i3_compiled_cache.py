@@ -85,7 +85,7 @@ def test_i3_a_damaged_cache_is_thrown_away_and_said_once(loops, damage, suffix):
 
 
 def test_i3_a_full_disk_keeps_nothing_and_says_so_once(loops, monkeypatch):
-    folder, fresh = loops
+    _, fresh = loops
 
     def full(self, name, data):
         raise OSError(28, "No space left on device")
