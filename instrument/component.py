@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import importlib
 import inspect
 import json
 import re
+import sys
 from abc import ABC
 from collections.abc import Mapping
 from typing import Any, ClassVar, Self, get_args
@@ -24,16 +24,21 @@ from pydantic import (
 )
 
 from instrument.errors import InputError, did_you_mean
+from instrument.numbers import brief
+from instrument.registry import load, plugin_class, plugin_name
 
-TAG = "component"
+KIND = "kind"  # the key under which text names a class: a plugin by its name, another component by its class name
+OLD_TAG = "component"  # "module:Class", written until 2026-11; understood for classes that are known, never imported
 
 
 class Component(BaseModel, ABC):
     """A frozen set of named, validated settings; equal when its fields are equal.
 
     A subclass is abstract or final. Fields are given by keyword with their units; wrong input raises `InputError` in
-    one line. `to_json` writes the class beside the fields, `from_json` gives the same subclass back. A field that is
-    typed with an abstract component also takes the name of a plugin when the class names its `plugin_kind`.
+    one line. `to_json` writes the class beside the fields as `{"kind": name}`, `from_json` gives the same subclass
+    back: a plugin by its name, another class by its class name, once it is defined; text never imports a module. A
+    field that is typed with an abstract component also takes the name of a plugin, or `{"kind": name, ...}` with its
+    settings, when the class names its `plugin_kind`.
     """
 
     model_config = ConfigDict(
@@ -54,15 +59,13 @@ class Component(BaseModel, ABC):
     @classmethod
     def _right_subclass(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
         if isinstance(data, str) and cls.plugin_kind:
-            from instrument.registry import load
-
             return _checked(load(cls.plugin_kind, data), cls)
-        if isinstance(data, Mapping) and TAG in data:
-            found = _class_of(str(data[TAG]), cls)
-            fields = {k: v for k, v in data.items() if k != TAG}
+        if isinstance(data, Mapping) and (KIND in data or OLD_TAG in data):
+            found = class_of(data, cls)
+            fields = {k: v for k, v in data.items() if k not in (KIND, OLD_TAG)}
             return handler(fields) if found is cls else found(**fields)
         if isinstance(data, Mapping) and inspect.isabstract(cls):
-            raise InputError(f"{cls.__name__} is abstract: the text must name a class under '{TAG}'")
+            raise InputError(f"{cls.__name__} is abstract: the text must name a class under '{KIND}'")
         return handler(data)
 
     @model_serializer(mode="wrap")
@@ -70,7 +73,7 @@ class Component(BaseModel, ABC):
         fields = handler(self)
         if not type(self).model_fields.keys() <= fields.keys():  # the field that holds it is typed with a base class
             return type(self).__pydantic_serializer__.to_python(self, mode=info.mode)
-        return {TAG: f"{type(self).__module__}:{type(self).__qualname__}", **fields}
+        return {KIND: public_name(type(self)), **fields}
 
     def to_json(self, indent: int | None = None) -> str:
         """The component as JSON text; every value with a unit is a string with that unit."""
@@ -154,16 +157,38 @@ def _checked(found: Any, wanted: type[Any]) -> Any:
     return found
 
 
-def _class_of(tag: str, wanted: type[Component]) -> type[Any]:
-    module, _, name = tag.partition(":")
-    try:
-        found: Any = importlib.import_module(module)
-        for part in name.split("."):
-            found = getattr(found, part)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise InputError(f"component '{tag}' cannot be imported: {error}") from None
-    if not (isinstance(found, type) and issubclass(found, wanted)):
-        raise InputError(f"component '{tag}' is not a {wanted.__name__}")
+def public_name(cls: type[Component]) -> str:
+    """What text calls a class: the name of the plugin that it is, or else its class name."""
+    found = plugin_name(cls.plugin_kind, cls) if cls.plugin_kind else None
+    return found or cls.__name__
+
+
+def class_of(data: Mapping[str, Any], wanted: type[Component]) -> type[Any]:
+    """The class that a mapping names under "kind": a plugin, or a class that is defined; no module is imported."""
+    tag = data.get(KIND, data.get(OLD_TAG))
+    if not isinstance(tag, str):
+        raise InputError(f"{KIND} = {brief(tag)} must be the name of a class or of a plugin")
+    known = _subclasses(wanted)
+    kinds = {c.plugin_kind for c in (wanted, *known.values()) if c.plugin_kind}
+    plugins = [c for kind in sorted(kinds) if isinstance(c := plugin_class(kind, tag), type)]
+    name = tag.rpartition(":")[2].rpartition(".")[2]
+    top = sys.modules[__name__.partition(".")[0]]
+    public = getattr(top, name) if name in getattr(top, "__all__", ()) else None
+    for found in (*(c for c in plugins if issubclass(c, wanted)), known.get(name), public, *plugins):
+        if isinstance(found, type) and issubclass(found, Component):
+            if not issubclass(found, wanted):
+                raise InputError(f"'{tag}' is {found.__name__}, which is not a {wanted.__name__}")
+            return found
+    if wanted.plugin_kind:
+        plugin_class(wanted.plugin_kind, tag, needed=True)
+    raise InputError(f"no {wanted.__name__} is called {brief(tag)}: {did_you_mean(tag, known)}")
+
+
+def _subclasses(wanted: type[Component]) -> dict[str, type[Component]]:
+    """Every class defined so far that is a `wanted`, by its name; of two with one name, the later."""
+    found = {wanted.__name__: wanted}
+    for cls in wanted.__subclasses__():
+        found |= _subclasses(cls)
     return found
 
 

@@ -1,9 +1,13 @@
-"""The error family, the outcome of a solver, and the wording of "did you mean"."""
+"""The error family, the one way to warn, what was not used, the outcome of a solver, the wording of "did you mean"."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import sys
+import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from enum import Enum
 
 
@@ -41,6 +45,49 @@ class RefusedError(InputError):
 
 class InstrumentWarning(UserWarning):
     """The result is right for what was asked, but the user should know something."""
+
+
+class UnusedWarning(InstrumentWarning):
+    """Something that was given was not used: a column, a row, a header card, a table, a channel, an option."""
+
+
+_LEDGER: ContextVar[dict[str, list[str]] | None] = ContextVar("unused", default=None)
+_OWN = __name__.partition(".")[0]
+
+
+def warn(text: str, category: type[Warning] = InstrumentWarning) -> None:
+    """Warn at the line of the first caller outside this package, its plugins and pydantic."""
+    level, frame = 2, sys._getframe(1)
+    while frame.f_back is not None:
+        root = str(frame.f_globals.get("__name__", "")).partition(".")[0]
+        if not (root == "pydantic" or root.startswith(_OWN)):
+            break
+        level, frame = level + 1, frame.f_back
+    warnings.warn(text, category, stacklevel=level)
+
+
+def unused(source: str, names: Iterable[str], why: str = "") -> None:
+    """Say which parts of `source` were not used, in a warning and in the ledger of `unused_ledger`; nothing if none."""
+    listed = [str(name) for name in names]
+    if not listed:
+        return
+    ledger = _LEDGER.get()
+    if ledger is not None:
+        here = ledger.setdefault(source, [])
+        here += [name for name in listed if name not in here]
+    more = f" and {len(listed) - 20} more" if len(listed) > 20 else ""
+    warn(f"{source}: not used: {', '.join(listed[:20])}{more}{f' ({why})' if why else ''}", UnusedWarning)
+
+
+@contextmanager
+def unused_ledger() -> Iterator[dict[str, list[str]]]:
+    """Collects what `unused` says inside, by source: what `run.json` holds under "unused"."""
+    ledger: dict[str, list[str]] = {}
+    token = _LEDGER.set(ledger)
+    try:
+        yield ledger
+    finally:
+        _LEDGER.reset(token)
 
 
 class Outcome(Enum):

@@ -80,6 +80,22 @@ def _resolve(kind: str, name: str) -> Any:
         ) from error
 
 
+def plugin_class(kind: str, name: str, needed: bool = False) -> Any:
+    """What stands behind a name, or behind "module:Class" where a plugin is registered as that.
+
+    `None` where there is none, or, if `needed`, a `PluginError` that lists the known ones.
+    """
+    names = _found(kind)
+    found = next((n for n, points in names.items() if name in (n, points[0].value)), name)
+    return _resolve(kind, found) if needed or found in names else None
+
+
+def plugin_name(kind: str, cls: type) -> str | None:
+    """The name under which a class is registered, if it is, and nobody else claims that name."""
+    value = f"{cls.__module__}:{cls.__qualname__}"
+    return next((n for n, points in _found(kind).items() if [p.value for p in points] == [value]), None)
+
+
 def load(kind: str, name: str, **settings: Any) -> Any:
     """The plugin `name` of `kind`, constructed with `settings`; raises `PluginError` or `InputError`."""
     if not isinstance(name, str):

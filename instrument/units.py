@@ -1,8 +1,9 @@
-"""Unit-aware fields of components: a unit at the door, plain SI numbers inside.
+"""The door for numbers: fields with units, plain numbers within a range, arrays, directions, times.
 
 `Metres`, `Seconds`, `Hertz`, `Radians`, `Jansky`, ... annotate a field of a `Component`. They accept an astropy
 `Quantity` or a string such as "30.8 m", store a float in the SI unit of the name (Jansky stays Jy, as the field does)
-and go to JSON as a string with the unit.
+and go to JSON as a string with the unit. Numbers without a unit go through `Whole`, `Real` and `Span`
+(`instrument/numbers.py`), as fields and at calls alike.
 """
 
 from __future__ import annotations
@@ -17,6 +18,28 @@ from pydantic import BeforeValidator, GetCoreSchemaHandler, PlainSerializer, Val
 from pydantic_core import core_schema
 
 from instrument.errors import InputError, UnitError
+from instrument.numbers import COUNT as COUNT
+from instrument.numbers import FINITE as FINITE
+from instrument.numbers import INDEX as INDEX
+from instrument.numbers import NOT_NEGATIVE as NOT_NEGATIVE
+from instrument.numbers import POSITIVE as POSITIVE
+from instrument.numbers import SEED as SEED
+from instrument.numbers import SHARE as SHARE
+from instrument.numbers import TOLERANCE as TOLERANCE
+from instrument.numbers import UV_RANGE as UV_RANGE
+from instrument.numbers import Count as Count
+from instrument.numbers import Finite as Finite
+from instrument.numbers import Index as Index
+from instrument.numbers import NotNegative as NotNegative
+from instrument.numbers import Positive as Positive
+from instrument.numbers import Real as Real
+from instrument.numbers import Seed as Seed
+from instrument.numbers import Share as Share
+from instrument.numbers import Span as Span
+from instrument.numbers import Tolerance as Tolerance
+from instrument.numbers import UvRange as UvRange
+from instrument.numbers import Whole as Whole
+from instrument.numbers import brief, out_of_range
 
 Complex = NDArray[np.complexfloating[Any, Any]]
 Float = NDArray[np.float64]
@@ -24,8 +47,13 @@ Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
 
-def to_si(value: object, unit: str, name: str = "the value") -> Any:
-    """Value of a `Quantity` or of a string with a unit, as float(s) in `unit`; raises `UnitError` for a bare number."""
+def to_si(
+    value: object, unit: str, name: str = "the value", at_least: float | None = None, above: float | None = None
+) -> Any:
+    """Value of a `Quantity` or of a string with a unit, as finite float(s) in `unit`.
+
+    Raises `UnitError` for a bare number or another kind of unit, `InputError` for what is not finite or out of range.
+    """
     from astropy import units as u
 
     wanted = u.Unit(unit)
@@ -33,37 +61,56 @@ def to_si(value: object, unit: str, name: str = "the value") -> Any:
         try:
             value = u.Quantity(value)
         except (TypeError, ValueError) as error:
-            raise UnitError(f"{name} = '{value}' is not a number with a unit convertible to {unit}") from error
+            raise UnitError(f"{name} = {brief(value)} is not a number with a unit convertible to {unit}") from error
     elif isinstance(value, list | tuple) and value and all(isinstance(v, str | u.Quantity) for v in value):
-        return np.array([to_si(v, unit, name) for v in value], float)
+        return np.array([to_si(v, unit, name, at_least, above) for v in value], float)
     if not isinstance(value, u.Quantity):
-        raise UnitError(f"{name} needs a unit convertible to {unit}, got the bare {value!r}; write it with its unit")
+        raise UnitError(
+            f"{name} needs a unit convertible to {unit}, got the bare {brief(value)}; write it with its unit"
+        )
     try:
-        number = value.to_value(wanted)
+        number = np.asarray(value.to_value(wanted))
     except u.UnitConversionError as error:
         raise UnitError(f"{name} needs a unit convertible to {unit}, got '{value}'") from error
-    return float(number) if np.ndim(number) == 0 else np.asarray(number, float)
+    if number.dtype.kind not in "fiu":
+        raise InputError(f"{name} = {brief(value)} is not a real number")
+    number = number.astype(float)
+    if not np.all(np.isfinite(number)):
+        raise InputError(f"{name} is not finite" if number.ndim else f"{name} = {number} {unit} is not finite")
+    if why := out_of_range(number, at_least, above):
+        worst = float(number.min(initial=np.inf))
+        raise InputError(f"{name} = {worst:g} {unit} must be {why} {unit}")
+    return float(number) if number.ndim == 0 else number
+
+
+def one_si(
+    value: object, unit: str, name: str = "the value", at_least: float | None = None, above: float | None = None
+) -> float:
+    """The same for one value: a list raises `InputError`."""
+    number = to_si(value, unit, name, at_least, above)
+    if np.ndim(number):
+        raise InputError(f"{name} takes one value, got {np.shape(number)}")
+    return float(number)
 
 
 @dataclass(frozen=True)
 class In:
-    """Marks a field: the unit it is stored in, and whether it is an array (one axis)."""
+    """Marks a field: the unit it is stored in, its range in that unit, and whether it is an array (one axis)."""
 
     unit: str
     array: bool = False
+    at_least: float | None = None
+    above: float | None = None
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
         def check(value: object, info: core_schema.ValidationInfo) -> Any:
-            number = to_si(value, self.unit, info.field_name or "the value")
-            if not np.all(np.isfinite(number)):
-                raise InputError(f"{info.field_name} is not finite")
-            if not self.array and np.ndim(number):
-                raise InputError(f"{info.field_name} takes one value, got {np.shape(number)}")
-            if self.array:
-                number = np.array(np.atleast_1d(number), float)
-                if number.ndim != 1:
-                    raise InputError(f"{info.field_name} takes a list of values, got {np.shape(number)}")
-                number.setflags(write=False)
+            name = info.field_name or "the value"
+            if not self.array:
+                return one_si(value, self.unit, name, self.at_least, self.above)
+            number = np.array(np.atleast_1d(to_si(value, self.unit, name, self.at_least, self.above)), float)
+            if number.ndim != 1:
+                raise InputError(f"{name} takes a list of values, got {np.shape(number)}")
+            number.setflags(write=False)
             return number
 
         def write(value: Any) -> Any:
@@ -81,17 +128,34 @@ Hertz = Annotated[float, In("Hz")]
 HertzArray = Annotated[Float, In("Hz", array=True)]
 Radians = Annotated[float, In("rad")]
 Jansky = Annotated[float, In("Jy")]
-Bytes = Annotated[float, In("byte")]
+PositiveMetres = Annotated[float, In("m", above=0)]
+PositiveSeconds = Annotated[float, In("s", above=0)]
+PositiveHertz = Annotated[float, In("Hz", above=0)]
+PositiveHertzArray = Annotated[Float, In("Hz", array=True, above=0)]
+PositiveRadians = Annotated[float, In("rad", above=0)]
 
 
-def plain(value: Any, dtype: type, name: str) -> Any:
-    """A copy of numbers as an array; raises `UnitError` for a `Quantity`, whose unit numpy would drop."""
+def plain(value: Any, dtype: type, name: str, finite: bool = False, at_least: float | None = None) -> Any:
+    """A copy of numbers as an array; raises `UnitError` for a `Quantity`, whose unit numpy would drop.
+
+    Text is no number, and what `dtype` cannot hold (a complex value, 2.5 as an int) is refused.
+    """
     if getattr(value, "unit", None) is not None:
         raise UnitError(f"{name} takes plain numbers in SI units, got values in '{value.unit}': use .to_value(...)")
     try:
-        return np.array(value, dtype=dtype)
-    except (TypeError, ValueError) as error:
+        given = np.asarray(value)
+        if given.size and (given.dtype.kind in "USOMmV" or (given.dtype.kind == "c" and np.dtype(dtype).kind != "c")):
+            raise TypeError(f"got {brief(value)}")
+        array: Any = np.array(given, dtype=dtype)
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{name} is not an array of numbers: {error}") from None
+    if np.dtype(dtype).kind in "iu" and given.dtype.kind == "f" and not np.array_equal(array, given):
+        raise InputError(f"{name} = {brief(value)} must be whole numbers")
+    if finite and not np.all(np.isfinite(array)):
+        raise InputError(f"{name} must be finite")
+    if at_least is not None and np.any(array < at_least):
+        raise InputError(f"{name} must be at least {at_least:g}, got {float(array.min()):g}")
+    return array
 
 
 @dataclass(frozen=True)

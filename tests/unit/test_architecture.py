@@ -22,7 +22,8 @@ HEAVY = {"astropy", "scipy", "numba", "matplotlib", "ducc0", "h5py", "jinja2", "
 # stands for a module or for a whole package.
 LAYERS = (
     ("errors", "data", "scenes", "whole_file"),
-    ("units", "run_folder", "compiled"),
+    ("numbers", "run_folder", "compiled"),
+    ("units",),
     ("files_in",),
     ("registry", "mat2", "phasor"),
     ("component",),

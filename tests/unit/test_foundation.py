@@ -270,7 +270,7 @@ def test_every_kind_of_field_comes_back_from_json_as_it_was():
 
 def test_values_with_units_are_written_with_their_units():
     assert json.loads(Disc(radius=2 * u.cm).to_json()) == {
-        "component": f"{__name__}:Disc",
+        "kind": "Disc",
         "radius": "0.02 m",
     }
 
@@ -343,12 +343,16 @@ def test_a_whole_scene_comes_back_from_json():
     [
         ("{", "not JSON"),
         ("[1, 2]", "dictionary"),
-        ('{"component": "os:path"}', "is not a"),
-        ('{"component": "no.such.module:X"}', "cannot be imported"),
-        ('{"component": "instrument.jones.gain:NoSuchTerm"}', "cannot be imported"),
+        ('{"kind": "os:path"}', "no JonesTerm is called 'os:path'"),
+        ('{"kind": 3}', "kind = 3 must be the name of a class"),
+        ('{"kind": "GianTerm"}', "did you mean 'GainTerm'"),
+        ('{"kind": "Layout"}', "'Layout' is Layout, which is not a JonesTerm"),
+        ('{"component": "os:path"}', "no JonesTerm is called 'os:path'"),
+        ('{"component": "no.such.module:X"}', "no JonesTerm is called"),
+        ('{"component": "instrument.jones.gain:NoSuchTerm"}', "no JonesTerm is called"),
         ('{"component": "instrument.jones.gain:GainTerm", "rsm": 1}', "did you mean 'rms'"),
         ('{"component": "instrument.observe.layout:Layout"}', "is not a"),
-        ("{}", "component"),
+        ("{}", "kind"),
     ],
 )
 def test_text_that_is_not_a_component_is_refused(text, message):
