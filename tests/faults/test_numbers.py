@@ -65,7 +65,7 @@ class Knobs(Component):
     bins: Count = 12
     seed: Seed = 0
     uv_range: UvRange | None = None
-    wait: PositiveSeconds = "1 s"
+    wait: PositiveSeconds = 1.0
 
 
 def test_fields_go_through_the_same_door():
