@@ -60,7 +60,7 @@ class Component(BaseModel, ABC):
     def _right_subclass(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
         if isinstance(data, str) and cls.plugin_kind:
             return _checked(load(cls.plugin_kind, data), cls)
-        if isinstance(data, Mapping) and (KIND in data or OLD_TAG in data):
+        if isinstance(data, Mapping) and (KIND in data or ":" in str(data.get(OLD_TAG))):
             found = class_of(data, cls)
             fields = {k: v for k, v in data.items() if k not in (KIND, OLD_TAG)}
             return handler(fields) if found is cls else found(**fields)
