@@ -9,7 +9,8 @@ import re
 import sys
 from abc import ABC
 from collections.abc import Mapping
-from typing import Any, ClassVar, Self, get_args
+from types import UnionType
+from typing import Any, ClassVar, Self, Union, get_args, get_origin
 
 import numpy as np
 from pydantic import (
@@ -42,7 +43,12 @@ class Component(BaseModel, ABC):
     """
 
     model_config = ConfigDict(
-        frozen=True, extra="forbid", arbitrary_types_allowed=True, populate_by_name=True, ser_json_inf_nan="constants"
+        frozen=True,
+        extra="forbid",
+        arbitrary_types_allowed=True,
+        populate_by_name=True,
+        ser_json_inf_nan="constants",
+        allow_inf_nan=False,
     )
     plugin_kind: ClassVar[str | None] = None
 
@@ -66,6 +72,8 @@ class Component(BaseModel, ABC):
             return handler(fields) if found is cls else found(**fields)
         if isinstance(data, Mapping) and inspect.isabstract(cls):
             raise InputError(f"{cls.__name__} is abstract: the text must name a class under '{KIND}'")
+        if isinstance(data, Mapping):
+            _text_is_no_number(cls, data)
         return handler(data)
 
     @model_serializer(mode="wrap")
@@ -149,6 +157,28 @@ def _same(a: Any, b: Any) -> bool:
     if isinstance(a, tuple | list) and isinstance(b, tuple | list):
         return len(a) == len(b) and all(_same(x, y) for x, y in zip(a, b, strict=True))
     return bool(a == b)
+
+
+def _text_is_no_number(cls: type[Component], data: Mapping[Any, Any]) -> None:
+    """Refuse text and truth values where a field takes plain numbers: pydantic would make 2 of "2" and 1 of True."""
+    for name, info in cls.model_fields.items():
+        if any(hasattr(mark, "__get_pydantic_core_schema__") for mark in info.metadata):
+            continue  # a field with a door of its own
+        wrong = _no_number(info.annotation, data.get(name, data.get(info.alias) if info.alias else None))
+        if wrong is not None:
+            raise InputError(f"{info.alias or name} = {brief(wrong)} must be a number")
+
+
+def _no_number(annotation: Any, value: Any) -> Any:
+    """The text or truth value that stands where an annotation such as `int | None` takes a number, if any."""
+    options = {annotation, *(get_args(annotation) if get_origin(annotation) in (UnionType, Union) else ())}
+    if isinstance(value, str | bytes | bool | np.bool_):
+        return value if options & {int, float} and not options & {str, bool} else None
+    for option in options:
+        if get_origin(option) is tuple and isinstance(value, tuple | list):
+            inner = get_args(option)[0]
+            return next((w for v in value if (w := _no_number(inner, v)) is not None), None)
+    return None
 
 
 def _checked(found: Any, wanted: type[Any]) -> Any:

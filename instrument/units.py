@@ -48,9 +48,14 @@ Bool = NDArray[np.bool_]
 
 
 def to_si(
-    value: object, unit: str, name: str = "the value", at_least: float | None = None, above: float | None = None
+    value: object,
+    unit: str,
+    name: str = "the value",
+    at_least: float | None = None,
+    above: float | None = None,
+    nan: bool = False,
 ) -> Any:
-    """Value of a `Quantity` or of a string with a unit, as finite float(s) in `unit`.
+    """Value of a `Quantity` or of a string with a unit, as finite float(s) in `unit`; with `nan`, NaN is "not known".
 
     Raises `UnitError` for a bare number or another kind of unit, `InputError` for what is not finite or out of range.
     """
@@ -63,7 +68,7 @@ def to_si(
         except (TypeError, ValueError) as error:
             raise UnitError(f"{name} = {brief(value)} is not a number with a unit convertible to {unit}") from error
     elif isinstance(value, list | tuple) and value and all(isinstance(v, str | u.Quantity) for v in value):
-        return np.array([to_si(v, unit, name, at_least, above) for v in value], float)
+        return np.array([to_si(v, unit, name, at_least, above, nan) for v in value], float)
     if not isinstance(value, u.Quantity):
         raise UnitError(
             f"{name} needs a unit convertible to {unit}, got the bare {brief(value)}; write it with its unit"
@@ -75,12 +80,18 @@ def to_si(
     if number.dtype.kind not in "fiu":
         raise InputError(f"{name} = {brief(value)} is not a real number")
     number = number.astype(float)
-    if not np.all(np.isfinite(number)):
-        raise InputError(f"{name} is not finite" if number.ndim else f"{name} = {number} {unit} is not finite")
+    wrong = np.isinf(number) if nan else ~np.isfinite(number)
+    if np.any(wrong):
+        raise InputError(f"{_worst(name, number, wrong)} {unit} is not finite")
     if why := out_of_range(number, at_least, above):
-        worst = float(number.min(initial=np.inf))
-        raise InputError(f"{name} = {worst:g} {unit} must be {why} {unit}")
+        raise InputError(f"{_worst(name, number, number == np.nanmin(number))} {unit} must be {why} {unit}")
     return float(number) if number.ndim == 0 else number
+
+
+def _worst(name: str, number: Any, wrong: Any) -> str:
+    """Name and value of the first wrong number of an array: `frequencies[1] = nan`."""
+    index = [int(i) for i in np.argwhere(wrong)[0]]
+    return f"{name}{index or ''} = {float(number[tuple(index)]):g}"
 
 
 def one_si(

@@ -163,7 +163,7 @@ def _beams(file: str, header: Any, table: Any, channels: int) -> Float:
         columns = table.columns
         return np.stack(
             [
-                to_si(np.asarray(rows[k], float) * _angle(file, columns[k].unit), "rad", k)
+                to_si(np.asarray(rows[k], float) * _angle(file, columns[k].unit), "rad", k, nan=True)
                 if k in columns.names
                 else np.zeros(channels)
                 for k in keys

@@ -40,8 +40,10 @@ class Psf:
 
         Quantities; `minor` is `major` unless given, `angle` (of the major axis, north through east) is 0.
         """
-        widths = (to_si(major, "rad", "major"), to_si(major if minor is None else minor, "rad", "minor"))
-        turned = 0.0 if angle is None else to_si(angle, "rad", "angle")
+        widths = (
+            to_si(m, "rad", n, nan=True) for m, n in ((major, "major"), (major if minor is None else minor, "minor"))
+        )
+        turned = 0.0 if angle is None else to_si(angle, "rad", "angle", nan=True)
         a, b, pa = np.broadcast_arrays(*(np.atleast_1d(np.asarray(x, float)) for x in (*widths, turned)))
         return cls(None, a, b, pa, np.zeros(len(a)))
 

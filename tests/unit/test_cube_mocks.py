@@ -263,7 +263,7 @@ def test_impossible_noise_is_refused():
         noise_cube(like(), 60)
     with pytest.raises(InputError, match="sigma needs a unit convertible to Jy/beam"):
         noise_cube(like(unit="Jy/beam"), 1 * u.K)
-    with pytest.raises(InputError, match="sigma = nan K is not one value or 2, finite and not below 0"):
+    with pytest.raises(InputError, match="sigma = nan K is not finite"):
         noise_cube(like(), np.nan * u.K)
     with pytest.raises(InputError, match="is not one value or 2"):
         noise_cube(like(), [1, 2, 3] * u.K)
