@@ -5,13 +5,11 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
-from instrument.errors import InputError, InstrumentError, InstrumentWarning, did_you_mean
-
-DONE, FAILED, BAD_INPUT, FELL_SHORT = 0, 1, 2, 3
+from instrument.errors import InputError, did_you_mean
+from instrument.terminal import DONE, FAILED, FELL_SHORT, process, show, status_of
 
 
 class _Parser(argparse.ArgumentParser):
@@ -94,27 +92,23 @@ def _add_analyze(verbs: Any) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status."""
-    warnings.showwarning = _show_warning  # type: ignore[assignment]
+    """Run the command line; returns the exit status. Without `argv` it is this process's, whose signals it takes."""
+    given = sys.argv[1:] if argv is None else argv
+    return (process if argv is None else status_of)(lambda: _verb(_parsed(given)))
+
+
+def _parsed(words: Sequence[str]) -> argparse.Namespace | int:
+    words = _joined(words)
     try:
-        words = _joined(sys.argv[1:] if argv is None else argv)
         given = parser().parse_args(words)
-        given.words = words
-        return int(VERBS[given.verb](given))
-    except InputError as error:
-        print(f"instrument: {_flat(error)}", file=sys.stderr)
-        return BAD_INPUT
-    except InstrumentError as error:
-        print(f"instrument: {_flat(error)}", file=sys.stderr)
-        return FAILED
-    except KeyboardInterrupt:
-        print("instrument: stopped; nothing was written", file=sys.stderr)
-        return FAILED
-    except MemoryError:
-        print("instrument: not enough memory: ask for fewer depths, channels or pixels", file=sys.stderr)
-        return FAILED
-    except BrokenPipeError:
-        return DONE
+    except SystemExit as done:  # --help
+        return int(done.code or 0)
+    given.words = words
+    return given
+
+
+def _verb(given: argparse.Namespace | int) -> int:
+    return given if isinstance(given, int) else int(VERBS[given.verb](given))
 
 
 def _joined(words: Sequence[str]) -> list[str]:
@@ -128,17 +122,9 @@ def _joined(words: Sequence[str]) -> list[str]:
     return out
 
 
-def _flat(error: Exception) -> str:
-    return " ".join(str(error).split())
-
-
-def _show_warning(message: Any, category: Any, *rest: Any) -> None:
-    if issubclass(category, InstrumentWarning):
-        print(f"instrument: warning: {_flat(message)}", file=sys.stderr)
-
-
 def _scene_file(given: argparse.Namespace) -> Any:
-    from instrument.scene_file import override, parse, read_tables
+    from instrument.scene_file import parse
+    from instrument.scene_text import override, read_tables
 
     tables = override(read_tables(given.scene), given.settings)
     for key in ("tolerance", "engine"):
@@ -160,7 +146,7 @@ def _run(given: argparse.Namespace) -> int:
         memory=given.memory,
         workers=given.workers,
         verify=not given.no_verify,
-        show=print,
+        show=show,
     )
     return DONE if result.passed else FELL_SHORT
 
@@ -170,7 +156,7 @@ def _analyze(given: argparse.Namespace) -> int:
 
     from instrument.analyze_run import analyze_files
     from instrument.cube_analysis import CubeAnalysis
-    from instrument.scene_file import override
+    from instrument.scene_text import override
 
     def listed(name: str) -> Any:
         text = getattr(given, name)
@@ -197,7 +183,7 @@ def _analyze(given: argparse.Namespace) -> int:
     settings = CubeAnalysis(remover=override({}, given.remover), cubes=given.cubes, **fields)
     words = ["instrument", *given.words]
     result = analyze_files(
-        given.files, settings, given.out, given.stokes, given.unit, given.beam, given.noise, shlex.join(words), print
+        given.files, settings, given.out, given.stokes, given.unit, given.beam, given.noise, shlex.join(words), show
     )
     return DONE if result.passed else FELL_SHORT
 
@@ -205,15 +191,15 @@ def _analyze(given: argparse.Namespace) -> int:
 def _plan(given: argparse.Namespace) -> int:
     _, scene_file = _scene_file(given)
     plan = scene_file.plan(scene_file.scene(), given.memory, given.workers)
-    print(plan)
+    show(str(plan))
     return DONE
 
 
 def _scenes(given: argparse.Namespace) -> int:
-    from instrument.scene_file import shipped
+    from instrument.scene_text import shipped
 
     for name, title in shipped().items():
-        print(f"{name:<20} {title}")
+        show(f"{name:<20} {title}")
     return DONE
 
 
@@ -222,9 +208,9 @@ def _plugins(given: argparse.Namespace) -> int:
 
     for kind in KINDS:
         found = available(kind)
-        print(f"{kind}" if found else f"{kind} (none)")
+        show(f"{kind}" if found else f"{kind} (none)")
         for plugin in found.values():
-            print(
+            show(
                 f"  {plugin.name:<18} {plugin.package:<14} {plugin.target}"
                 + (f"\n    BROKEN: {plugin.broken}" if plugin.broken else "")
             )
@@ -234,7 +220,7 @@ def _plugins(given: argparse.Namespace) -> int:
 def _doctor(given: argparse.Namespace) -> int:
     from instrument.doctor import doctor
 
-    return DONE if doctor(print) else FAILED
+    return DONE if doctor(show) else FAILED
 
 
 VERBS = {"run": _run, "plan": _plan, "analyze": _analyze, "scenes": _scenes, "plugins": _plugins, "doctor": _doctor}

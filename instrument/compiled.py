@@ -5,14 +5,13 @@ from __future__ import annotations
 import hashlib
 import os
 import pickle
-import warnings
 from collections.abc import Callable
 from typing import Any
 
 import numba
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 
-from instrument.errors import InstrumentWarning
+from instrument.errors import warn
 
 DIGEST = hashlib.sha256().digest_size
 _said: set[str] = set()
@@ -38,7 +37,7 @@ def _say(what: str, then: str) -> None:
     """Warn, once in a process for each kind of trouble."""
     if what not in _said:
         _said.add(what)
-        warnings.warn(f"{what}: {then}", InstrumentWarning, stacklevel=2)
+        warn(f"{what}: {then}")
 
 
 class _Checked(IndexDataCacheFile):

@@ -52,7 +52,7 @@ class Component(BaseModel, ABC):
     )
     plugin_kind: ClassVar[str | None] = None
 
-    def __init__(self, *values: Any, **fields: Any) -> None:
+    def __init__(self, /, *values: Any, **fields: Any) -> None:
         if values:
             known = ", ".join(f"{name}=..." for name in type(self).model_fields)
             raise InputError(f"{type(self).__name__} takes its settings by keyword: {known}")

@@ -96,7 +96,7 @@ def plugin_name(kind: str, cls: type) -> str | None:
     return next((n for n, points in _found(kind).items() if [p.value for p in points] == [value]), None)
 
 
-def load(kind: str, name: str, **settings: Any) -> Any:
+def load(kind: str, name: str, /, **settings: Any) -> Any:
     """The plugin `name` of `kind`, constructed with `settings`; raises `PluginError` or `InputError`."""
     if not isinstance(name, str):
         raise InputError(f"a plugin is loaded by its name, got {name!r}")

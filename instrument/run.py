@@ -20,7 +20,8 @@ from instrument.plan import Plan
 from instrument.report.progress import progress_bar
 from instrument.run_folder import RunFolder
 from instrument.run_record import Result, json_ready, record, summary
-from instrument.scene_file import SEED_STEP, SceneFile, to_toml
+from instrument.scene_file import SEED_STEP, SceneFile
+from instrument.scene_text import to_toml
 from instrument.units import Float
 
 NOISE_SEED = 3

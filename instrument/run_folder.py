@@ -1,61 +1,148 @@
-"""The folder a run writes: chosen before anything is computed, whole or not there."""
+"""The folder a run writes: tried before anything is computed, whole or not there; and what dead runs have left."""
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import fcntl
+import os
 import shutil
 import tempfile
 from pathlib import Path
 
-from instrument.errors import InputError
+from instrument.errors import InputError, warn
+
+PARTIAL = ".instrument-partial"  # ends the names of folders that are being written
+TAKEN = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)  # what moving a folder onto something else answers
 
 
 class RunFolder:
     """A folder that is written beside itself and moved to its place by `finish`; used in a `with`.
 
-    Inside, `partial` is where to write. Without `finish` nothing is left, not even folders made for it. `out=None`
-    takes runs/NAME, or the next free name. Raises `InputError` when the folder is not empty or cannot be made.
+    Inside, `partial` is where to write. Without `finish` nothing is left, not even folders made for it; what runs that
+    were killed have left beside it is removed and named. `out=None` takes runs/NAME, or the next free name. Raises
+    `InputError` when the folder is not empty or cannot be made.
     """
 
     def __init__(self, name: str, out: str | None) -> None:
-        self._name, self._out = name, out
-        self.path = self._free()
+        self._name, self._out = name.strip(".") or "run", out
+        with self._one_line():
+            self.path = self._free()
         self._made: list[Path] = []
 
     def __enter__(self) -> RunFolder:
-        self._made = [p for p in self.path.parents if not p.exists()]
-        try:
+        with self._one_line():
+            self._made = [p for p in self.path.parents if not p.exists()]
+            for removed in clean(self.path.parent):
+                warn(removed)
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self.partial = Path(tempfile.mkdtemp(prefix=f".{self.path.name}.", dir=self.path.parent))
-            self.partial.chmod(0o755)
-        except OSError as error:
-            raise InputError(f"--out {self.path}: {error.strerror}; choose another folder") from None
+            short = self.path.name.encode()[:100].decode(errors="ignore")
+            fresh = Path(tempfile.mkdtemp(prefix=f".{short}.", dir=self.path.parent))
+            fresh.chmod(0o755)
+            # locked before it has the name of a partial folder: to the next run an unlocked one is a dead run's
+            self._lock = _locked(fresh)
+            self.partial = fresh.rename(fresh.with_name(fresh.name + PARTIAL))
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if error is not None and not self.partial.exists() and self.path.exists():
+            error.add_note(f"{self.path} is written")  # stopped after the move
         shutil.rmtree(self.partial, ignore_errors=True)
         for folder in self._made:  # made for a run that left nothing in them
-            if folder.exists() and not any(folder.iterdir()):
+            with contextlib.suppress(OSError):
                 folder.rmdir()
+        if self._lock is not None:
+            os.close(self._lock)
 
     def finish(self) -> Path:
-        """Move what was written to its place; the path."""
-        if self._out is None:
-            self.path = self._free()  # another run may have taken the name meanwhile
-        if self.path.exists():
-            self.path.rmdir()
-        self.partial.rename(self.path)
+        """Move what was written to its place; the path, which is the next free one where another run took the name."""
+        asked = self.path
+        while True:
+            try:
+                os.rename(self.partial, self.path)  # onto an empty folder, or where nothing is: in one step
+                break
+            except OSError as error:
+                if error.errno not in TAKEN:
+                    raise
+                self.path = _next_free(asked)
+        if self.path != asked:
+            warn(f"{asked} was taken meanwhile: the results are in {self.path}")
         return self.path
 
     def _free(self) -> Path:
         """The folder asked for, which must be empty, or the next free one under runs/."""
-        if self._out is not None:
-            folder = Path(self._out).resolve() if Path(self._out).name in ("", "..") else Path(self._out)
-            if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-                raise InputError(f"--out {self._out}: it exists and is not an empty folder; choose another")
-            return folder
-        folder = Path("runs") / self._name
-        count = 1
-        while folder.exists():
-            count += 1
-            folder = Path("runs") / f"{self._name}-{count}"
-        return folder
+        if self._out is None:
+            return _next_free(Path("runs") / self._name)
+        # a link is followed: its target is what is written
+        folder = Path(os.path.realpath(Path(self._out).expanduser()))
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise InputError(f"--out {self._out}: it exists and is not an empty folder; choose another")
+        if folder.is_dir() and os.path.ismount(folder):
+            raise InputError(
+                f"--out {self._out}: it is a mount point, which cannot be moved to; name a folder inside it"
+            )
+        return folder if Path(self._out).is_absolute() or folder.is_symlink() else Path(os.path.relpath(folder))
+
+    @contextlib.contextmanager
+    def _one_line(self):  # type: ignore[no-untyped-def]
+        """Says of an error of the disk which folder it is."""
+        where = f"--out {self._out}" if self._out is not None else f"runs/{self._name}"
+        try:
+            yield
+        except InputError:
+            raise
+        except (OSError, ValueError, RuntimeError) as error:  # a name with a NUL; a home that is not known
+            raise InputError(f"{where}: {getattr(error, 'strerror', None) or error}; choose another folder") from None
+
+
+def clean(folder: Path) -> list[str]:
+    """Remove partial folders of runs that are dead; a line for each that was found and is not in use."""
+    said = []
+    for path in leftovers(folder):
+        lock = _locked(path)
+        shutil.rmtree(path, ignore_errors=True)
+        if lock is not None:
+            os.close(lock)
+        state = "could not be removed" if path.exists() else "removed"
+        said.append(f"{path}, left by a run that was killed, {state}")
+    return said
+
+
+def leftovers(folder: Path) -> list[Path]:
+    """Partial folders in a folder that no running process holds."""
+    try:
+        names = sorted(os.listdir(folder))
+    except OSError:
+        return []
+    found = []
+    for path in (Path(folder) / name for name in names if name.startswith(".") and name.endswith(PARTIAL)):
+        if path.is_symlink() or not path.is_dir():
+            continue
+        lock = _locked(path)
+        if lock is not None:
+            found.append(path)
+            os.close(lock)
+    return found
+
+
+def _locked(folder: Path) -> int | None:
+    """A descriptor that holds a folder until it is closed or its process dies; `None` where another holds it."""
+    try:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    except OSError:
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:  # held, or a file system without locks: nothing is removed there
+        os.close(descriptor)
+        return None
+    return descriptor
+
+
+def _next_free(path: Path) -> Path:
+    """The path, or with the first number from 2 that is free."""
+    found, count = path, 1
+    while os.path.lexists(found):
+        count += 1
+        found = path.with_name(f"{path.name}-{count}")
+    return found

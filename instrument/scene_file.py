@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import os
-import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
-from datetime import date, datetime
-from importlib.resources import files
-from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol, Self
 
 import numpy as np
@@ -21,7 +16,7 @@ from instrument.calibrate.directional import DirectionalCal
 from instrument.calibrate.selfcal import SelfCal
 from instrument.component import Component
 from instrument.cube_analysis import CubeAnalysis
-from instrument.errors import FileError, InputError, did_you_mean
+from instrument.errors import InputError, did_you_mean
 from instrument.image.dirty import Imager
 from instrument.jones.feed import FeedTerm
 from instrument.jones.gain import GainTerm
@@ -247,91 +242,9 @@ class _in_table:
             raise type(error)(f"[{self.table}] {error}") from None
 
 
-def shipped() -> dict[str, str]:
-    """Names of the shipped scenes and their titles."""
-    found = {}
-    for entry in sorted(files("instrument.scenes").iterdir(), key=lambda e: e.name):
-        if entry.name.endswith(".toml"):
-            found[entry.name.removesuffix(".toml")] = tomllib.loads(entry.read_text()).get("title", "")
-    return found
-
-
-def read_tables(scene: str | os.PathLike[str]) -> dict[str, Any]:
-    """Tables of a scene file, or of the shipped scene of that name."""
-    path = Path(scene)
-    if path.suffix == ".toml" or path.exists():
-        if not path.is_file():
-            raise FileError(f"scene file '{path}' does not exist")
-        text, label = path.read_text(encoding="utf-8", errors="replace"), str(path)
-    else:
-        if str(scene) not in shipped():
-            raise InputError(
-                f"no scene is called '{scene}': {did_you_mean(str(scene), shipped())}; or give a .toml file"
-            )
-        text, label = (files("instrument.scenes") / f"{scene}.toml").read_text(), str(scene)
-    try:
-        return _plain(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise FileError(f"{label}: {error}") from None
-
-
-def _plain(tables: Any) -> Any:
-    """Tables with times written without quotes as text."""
-    if isinstance(tables, dict):
-        return {k: _plain(v) for k, v in tables.items()}
-    if isinstance(tables, list):
-        return [_plain(v) for v in tables]
-    return tables.isoformat() if isinstance(tables, date | datetime) else tables
-
-
-def override(tables: dict[str, Any], settings: Sequence[str]) -> dict[str, Any]:
-    """Tables with settings such as "sky.brightest=500" put in; values are TOML, or else text."""
-    import copy
-
-    out = copy.deepcopy(tables)
-    for setting in settings:
-        key, equals, text = setting.partition("=")
-        steps = [s.strip() for s in key.split(".")]
-        if not equals or not all(steps):
-            raise InputError(f"--set {setting}: write it like --set sky.brightest=500")
-        try:
-            value = _plain(tomllib.loads(f"value = {text}"))["value"]
-        except tomllib.TOMLDecodeError:
-            value = text.strip()
-        table = out
-        for step in steps[:-1]:
-            table = table.setdefault(step, {})
-            if not isinstance(table, dict):
-                raise InputError(f"--set {setting}: '{step}' is not a table")
-        table[steps[-1]] = value
-    return out
-
-
 def parse(tables: dict[str, Any]) -> SceneFile:
     """Tables as a checked `SceneFile`; raises `InputError` naming the key, the value and the nearest right one."""
     for name in ("instrument", "observation", "sky"):
         if name in tables and not isinstance(tables[name], dict):
             raise InputError(f"'{name}' must be a table, [{name}]")
     return SceneFile(**tables)
-
-
-def to_toml(tables: dict[str, Any]) -> str:
-    """Tables as TOML text; the inverse of reading them, for what a scene file holds."""
-    import json
-
-    def value(v: Any) -> str:
-        if isinstance(v, bool):
-            return "true" if v else "false"
-        if isinstance(v, str):
-            return json.dumps(v, ensure_ascii=False)
-        if isinstance(v, list):
-            return "[" + ", ".join(value(x) for x in v) + "]"
-        if isinstance(v, dict):
-            return "{ " + ", ".join(f"{k} = {value(x)}" for k, x in v.items()) + " }"
-        return repr(v)
-
-    lines = [f"{k} = {value(v)}" for k, v in tables.items() if not isinstance(v, dict)]
-    for name, table in tables.items():
-        if isinstance(table, dict):
-            lines += ["", f"[{name}]", *(f"{k} = {value(v)}" for k, v in table.items())]
-    return "\n".join(lines) + "\n"

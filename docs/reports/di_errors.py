@@ -17,7 +17,8 @@ from pathlib import Path
 from instrument.report.spectra import spectra_2d
 from instrument.report.style import save
 from instrument.run import run
-from instrument.scene_file import override, parse, read_tables
+from instrument.scene_file import parse
+from instrument.scene_text import override, read_tables
 
 HERE = Path(__file__).parent
 

@@ -23,7 +23,8 @@ from instrument.analyze.sweep import ranks
 from instrument.report.laboratory import errors_against_model
 from instrument.report.spectra import spectra_2d
 from instrument.report.style import save
-from instrument.scene_file import override, parse, read_tables
+from instrument.scene_file import parse
+from instrument.scene_text import override, read_tables
 
 HERE = Path(__file__).parent
 MODELS = (1, 5, 50, 400, 1000)

@@ -22,10 +22,10 @@ HEAVY = {"astropy", "scipy", "numba", "matplotlib", "ducc0", "h5py", "jinja2", "
 # stands for a module or for a whole package.
 LAYERS = (
     ("errors", "data", "scenes", "whole_file"),
-    ("numbers", "run_folder", "compiled"),
+    ("numbers", "run_folder", "compiled", "terminal"),
     ("units",),
     ("files_in",),
-    ("registry", "mat2", "phasor"),
+    ("registry", "mat2", "phasor", "scene_text"),
     ("component",),
     ("observe",),
     ("jones",),

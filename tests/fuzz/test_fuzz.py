@@ -1,0 +1,35 @@
+"""Hostile input of every kind is done whole or refused in one line: no traceback, hang, flood of memory or half folder.
+
+The default run takes a small sample; `long` some hundreds; `--fuzz 3000` thousands, with the seed `--fuzz-seed`.
+"""
+
+import pytest
+from fuzzing import seeds
+from fuzzing.choose import cases
+from fuzzing.harness import Zygote
+
+SAMPLE, LONG = 24, 400
+
+
+@pytest.fixture(scope="module")
+def zygote(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("fuzz")
+    (folder / "s.toml").write_text(seeds.SCENE)
+    with Zygote([["run", "s.toml", "--no-verify", "--out", "warm"]], folder) as started:
+        yield started
+
+
+def faults(zygote, count, seed):
+    """The cases that went wrong, as text."""
+    found = (zygote.judge(case) for case in cases(count, seed, zygote.folder / "seeds"))
+    return [str(verdict) for verdict in found if not verdict.good]
+
+
+def test_a_sample_of_hostile_input_is_done_or_refused(zygote):
+    assert faults(zygote, SAMPLE, 20261125) == []
+
+
+@pytest.mark.long
+def test_hundreds_of_hostile_inputs_are_done_or_refused(zygote, request):
+    count = request.config.getoption("--fuzz", default=None) or LONG
+    assert faults(zygote, count, request.config.getoption("--fuzz-seed", default=None) or 1) == []
