@@ -48,7 +48,7 @@ def printable(text: str) -> str:
 
 def status_of(work: Callable[[], int]) -> int:
     """The exit status of what `work` does; every error is one line."""
-    warnings.showwarning = _show_warning
+    warnings.showwarning = _show_warning  # type: ignore[assignment]
     try:
         return work()
     except InputError as error:
