@@ -8,7 +8,7 @@ from typing import Any
 
 from instrument.analyze.cells import Cells, cells_of
 from instrument.analyze.cylinders import Cylindrical, Spherical, cylindrical, spherical
-from instrument.analyze.faraday import Precision, rm_synthesis
+from instrument.analyze.faraday import Division, Precision, rm_synthesis
 from instrument.analyze.faraday_cube import FaradayCube
 from instrument.analyze.fourier import Stokes, Taper
 from instrument.analyze.leakage import Leakage, leakage_of
@@ -197,12 +197,12 @@ class Analyzer:
 
     def rm_synthesis(
         self,
-        depths: Any,
+        depths: Any = None,
         stokes: Stokes = "P",
         weights: Any = None,
         lambda2_0: Any = None,
         spectral_index: float | None = None,
-        divide_by_i: bool = False,
+        divide_by_i: bool | Division = False,
         precision: Precision | None = None,
         out: str | os.PathLike[str] | None = None,
         noise: Any = None,
@@ -210,12 +210,16 @@ class Analyzer:
     ) -> FaradayCube:
         """Faraday dispersion function at `depths` in rad/m², bare or a `Quantity`, in any order; see `FaradayCube`.
 
+        Without `depths` the axis is that of the band, `FaradayBand.depths`; a warning says where steps or span of an
+        axis do not fit the band.
+
         "P" is Q + iU; of a real Stokes parameter F(-phi) is the conjugate of F(phi). `weights` (F,) are such as
         1 / sigma²; a channel of weight 0 or without data counts nowhere, lambda²_0 included; a voxel that is NaN is
         left out of the sums of its pixel. `lambda2_0` in m² is the weighted mean of lambda²; with 0 the phases are
-        those of the emission. `spectral_index` a divides by (nu/nu0)^a; `divide_by_i` divides each voxel by Stokes I
-        (I <= 0 or not finite: left out) and multiplies F with I at nu0, of the power law fitted to I of the pixel; nu0
-        is the frequency of the mean lambda². `noise`, sigma of Q and of U in the unit of the cube, one number or (F,),
+        those of the emission. `spectral_index` a divides by (nu/nu0)^a; `divide_by_i` "voxel" divides each voxel by
+        Stokes I (I <= 0 or not finite: left out), "fit" by the power law fitted to I of the pixel (none above 0: NaN),
+        True by the fit where I is below 10 times its noise a channel; F is multiplied with the power law at nu0, the
+        frequency of the mean lambda². `noise`, sigma of Q and of U in the unit of the cube, one number or (F,),
         becomes that of F. `precision` "single" or "double" is that of the cube; single is good to 4e-7 of the largest
         |F|. `out` names a .npy file for F, which is then mapped: memory does not grow with it. `progress` is called
         with the fraction done. Raises `InputError` for infinite values and for a cube without data.

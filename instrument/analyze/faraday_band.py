@@ -14,6 +14,7 @@ from instrument.observe.directions import LIGHT
 from instrument.phasor import cis
 from instrument.units import Float, to_si
 
+MOST = 2001  # depths of an axis that nobody asked for
 STEPS = 100_000  # of the search for half height, each 0.125 over the width of the band
 
 
@@ -144,6 +145,46 @@ class FaradayBand:
     def max_scale(self) -> float:
         """pi / the smallest lambda²: wider slabs in Faraday depth are depolarized away."""
         return float(np.pi / self.lambda2.min())
+
+    def depths(self, first: float | None = None, last: float | None = None, most: int = MOST) -> Float:
+        """An axis of depths, rad/m² (N,): steps of FWHM / 8, or a little less, from `first` to `last`.
+
+        Without these from minus to plus the largest depth that a channel lets through, at least two FWHM, and `most`
+        depths: the axis is then shorter.
+        """
+        step = self.fwhm / 8
+        if not 0 < step < np.inf:
+            raise InputError("the RMSF of this band does not come down to half: give the depths")
+        if (first is None) != (last is None):
+            raise InputError("give both ends of the depths, or none")
+        if first is None or last is None:
+            reach = np.nan_to_num(self.phi_max, nan=0.0)
+            n = int(min(np.ceil(max(reach, 2 * self.fwhm) / step), (most - 1) // 2))
+            return np.asarray(step * np.arange(-n, n + 1), float)
+        return np.linspace(first, last, int(np.ceil((last - first) / step)) + 1)
+
+    def aliases(self, span: float, least: float = 0.5) -> tuple[tuple[float, float], ...]:
+        """Depths within `span` at which |R| comes back to `least` or more, and how high, highest first (20 at most)."""
+        from instrument.analyze.faraday_aliases import summits
+
+        depth, height = summits(self.lambda2, self.weights, span, self.fwhm)
+        high = [k for k in np.argsort(-height, kind="stable") if height[k] >= least][:20]
+        return tuple((float(depth[k]), float(min(height[k], 1.0))) for k in high)
+
+    def complaints(self, depths: Float) -> list[str]:
+        """What is wrong with an axis of depths in this band, in words: steps or span that do not fit its RMSF."""
+        out: list[str] = []
+        fwhm = self.fwhm
+        if len(depths) < 3 or not np.isfinite(fwhm):
+            return out
+        steps = np.diff(np.sort(depths))
+        if np.median(steps) > fwhm / 4 * (1 + 1e-6):
+            text = f"depths in steps of {np.median(steps):.4g} rad/m2, but the RMSF is {fwhm:.4g} wide (FWHM)"
+            out.append(f"{text}: sources between them are missed; take steps of {fwhm / 8:.3g}")
+        if 0 < np.ptp(depths) < 4 * fwhm:
+            text = f"depths over {np.ptp(depths):.4g} rad/m2, {np.ptp(depths) / fwhm:.2g} times the FWHM of the RMSF"
+            out.append(f"{text}, {fwhm:.4g}: peaks beyond them are not seen; this band reaches {self.phi_max:.3g}")
+        return out
 
     def __str__(self) -> str:
         return (

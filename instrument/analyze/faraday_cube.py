@@ -27,8 +27,11 @@ class FaradayCube:
     P = Q + iU or of a real Stokes parameter; the sums are over the voxels that have data, NaN where there is none.
     `rmsf` (R,) is the same of P = 1 with every channel that counts, at `rmsf_depths`: the differences of depths, of an
     uneven axis as many even steps. `weights` (F,) are 0 for channels left out. `noise` is that of the real and of the
-    imaginary part of F (of a real Stokes parameter: of both together), None where no sigma was given. `flags` are bits
-    (F / 8, pixels), set where a voxel is missing, None where none is.
+    imaginary part of F (of a real Stokes parameter: of both together), None where no sigma was given;
+    `measured_noise` the same from differences of neighbouring channels, the median over pixels, NaN of fewer than
+    three channels.
+    `channel_noise` (F,) is that of Q and of U in every channel, given or measured. `flags` are bits (F / 8, pixels),
+    set where a voxel is missing, None where none is.
     """
 
     data: Complex
@@ -41,6 +44,8 @@ class FaradayCube:
     unit: str
     stokes: str
     noise: float | None
+    measured_noise: float
+    channel_noise: Float
     flags: Any
     pixel_rad: float
     centre: Direction | None
@@ -72,10 +77,13 @@ class FaradayCube:
 
     def has_voxel(self, pixels: slice) -> Any:
         """Which voxels have data, bool (F, n), of a slice of the pixels in rows; channels left out have none."""
+        return self.has_pixels(np.arange(*pixels.indices(self.data[0].size)))
+
+    def has_pixels(self, pixels: Any) -> Any:
+        """Which voxels of some pixels (indices, n) have data, bool (F, n); channels left out have none."""
         used = self.weights > 0
-        start, stop, _ = pixels.indices(self.data[0].size)
         if self.flags is None:
-            return np.broadcast_to(used[:, None], (len(used), max(stop - start, 0)))
+            return np.broadcast_to(used[:, None], (len(used), len(pixels)))
         return used[:, None] & (np.unpackbits(self.flags[:, pixels], axis=0, count=len(used)) == 0)
 
     def noise_map(self) -> Float:
@@ -85,27 +93,14 @@ class FaradayCube:
         out = np.full(shape[0] * shape[1], level)
         if self.flags is not None:
             w, size = self.weights, max(1, (32 << 20) // len(self.weights))
-            whole = (w**2).sum() / w.sum() ** 2
+            square = (w * np.nan_to_num(self.channel_noise, nan=1.0)) ** 2
+            square = square if square.any() else w**2
+            whole = square.sum() / w.sum() ** 2
             for start in range(0, out.size, size):
                 there = self.has_voxel(slice(start, start + size))
                 with np.errstate(invalid="ignore"):
-                    out[start : start + size] *= np.sqrt((w**2 @ there) / (w @ there) ** 2 / whole)
+                    out[start : start + size] *= np.sqrt((square @ there) / (w @ there) ** 2 / whole)
         return out.reshape(shape)
-
-    @cached_property
-    def measured_noise(self) -> float:
-        """Noise of the real and imaginary part each, from the median of |F| at the outer fifth of |depths|.
-
-        median / sqrt(2 ln 2), of a Rayleigh distribution. Sidelobes of bright emission count as noise, and so does
-        emission at those depths.
-        """
-        outer = np.argsort(-np.abs(self.depths), kind="stable")[: max(1, len(self.depths) // 5)]
-        step = max(1, len(outer) * self.data[0].size // 2_000_000)  # 2e6 values give 0.1 %
-        values = np.concatenate([np.abs(self.data[k].reshape(-1)[::step]) for k in outer])
-        values = values[values > 0]  # spectra of zeros are no data; NaN is not above 0 either
-        if not values.size:
-            return np.nan
-        return float(np.median(values) / np.sqrt(2 * np.log(2)))
 
     def rmsf_at(self, depths: Any) -> Complex:
         """R(phi) at depths in rad/m², of pixels without flags; the shape of the depths."""

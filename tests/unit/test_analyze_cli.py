@@ -87,7 +87,7 @@ def test_a_cube_in_jy_needs_its_beam_for_a_window(tmp_path, capsys):
 
 def test_without_a_beam_the_window_is_left_out_and_said(tmp_path, capsys):
     screens("Jy/beam").write(tmp_path / "jy.fits")
-    assert run(tmp_path / "jy.fits", "--out", tmp_path / "out", "--depths", "-5,5,1") == 0
+    assert run(tmp_path / "jy.fits", "--out", tmp_path / "out", "--depths", "-7,7,0.5") == 0
     assert "window: the cube is in Jy/beam and its beam is not known" in capsys.readouterr().out
     assert QTable.read(tmp_path / "out" / "spectrum_spherical_I.ecsv")["power"].unit == (u.Jy / u.beam) ** 2 * u.Mpc**3
 
