@@ -44,7 +44,7 @@ def open_regular(path: Any, limit_bytes: int | None = None, what: str = "file") 
     try:
         found = os.fstat(number)
         if stat.S_ISDIR(found.st_mode):
-            raise FileError(f"'{shown}' is a folder; name the {what} in it")
+            raise FileError(f"'{shown}' is a folder; name the file in it")
         if not stat.S_ISREG(found.st_mode):
             raise FileError(f"'{shown}' is a pipe or a device, no regular file; write its contents into a file first")
         if limit_bytes is not None and found.st_size > limit_bytes:

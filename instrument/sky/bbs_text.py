@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from instrument.errors import FileError, did_you_mean
+from instrument.files_in import harmless
 
 FIELDS = (
     "Name", "Type", "Patch", "Ra", "Dec", "I", "Q", "U", "V", "MajorAxis", "MinorAxis", "Orientation",
@@ -29,7 +30,8 @@ WITH_UNIT = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*(deg|rad)", 
 
 def broken(path: Path, line: int | None, message: str, kind: str = "line") -> FileError:
     """The one-line error of a file: its name, the line or row, what is wrong and the remedy."""
-    return FileError(f"{path.name}, {kind} {line}: {message}" if line is not None else f"{path.name}: {message}")
+    where = f", {kind} {line}" if line is not None else ""
+    return FileError(f"{harmless(path.name)}{where}: {harmless(message)}")
 
 
 @dataclass(frozen=True)

@@ -53,6 +53,7 @@ class PointSky(Sky):
     major_rad: Column | None = None
     minor_rad: Column | None = None
     angle_rad: Column | None = None
+    not_read: tuple[str, ...] = ()
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -89,14 +90,23 @@ class PointSky(Sky):
         return self
 
     @classmethod
-    def read(cls, path: Any, centre: Any = None) -> PointSky:
+    def read(
+        cls,
+        path: Any,
+        centre: Any = None,
+        sizes: Any = None,
+        beam: Any = None,
+        frequency: Any = None,
+        incomplete: Any = "refuse",
+    ) -> PointSky:
         """Sources of a file: BBS/makesourcedb text, or a CSV, ECSV, FITS or VOTable table with named columns.
 
-        `centre` is the phase centre of the model, from which BBS files count orientations; see `readers.read`.
+        `centre` is the phase centre of the model, from which BBS files count orientations; the others say what a table
+        leaves open; see `readers.read`.
         """
         from instrument.sky.readers import read
 
-        return read(path, centre)
+        return read(path, centre, sizes, beam, frequency, incomplete)
 
     @classmethod
     def join(cls, *skies: PointSky) -> PointSky:
@@ -120,6 +130,7 @@ class PointSky(Sky):
             fields[field] = np.concatenate(
                 [np.full(len(s), fill) if g is None else g for s, g in zip(skies, given, strict=True)]
             )
+        fields["not_read"] = tuple(dict.fromkeys(text for s in skies for text in s.not_read))
         for field in ("ra_rad", "dec_rad", "stokes_jy"):
             fields[field] = np.concatenate([getattr(s, field) for s in skies])
         return cls(**fields)
