@@ -148,6 +148,8 @@ def lines_of(path: Path, text: Sequence[str]) -> list[Line]:
         if header or not raw.strip() or raw.lstrip().startswith("#"):
             continue
         if fields is None:
+            if raw.count(",") < 4:  # name, type, position, flux: no source, and nothing of it is shown
+                raise broken(path, number, "neither a format line nor a source; write FORMAT = Name, Type, Ra, Dec, I")
             fields = _format(path, None, WITHOUT_FORMAT_LINE)
         try:
             given = split(raw)

@@ -15,7 +15,7 @@ from instrument.errors import FileError, unused
 from instrument.files_in import SHOWN, harmless
 from instrument.sky.bbs_text import broken
 from instrument.sky.columns import KEPT, meaning_of
-from instrument.sky.tables import ROWS_AT_MOST, Column, Table, entry, first_line, heading, needed
+from instrument.sky.tables import ROWS_AT_MOST, Column, Table, entry, first_line, heading, needed, plain_unit
 from instrument.units import si_prefix
 
 CELLS_AT_MOST = 50_000_000  # of a VOTable: 400 MB of numbers
@@ -36,6 +36,8 @@ def fits_table(path: Path, raw: bytes) -> Table:
                 if hdu.size > len(raw):
                     there = si_prefix(len(raw), "B")
                     raise broken(path, None, f"extension {k} declares {si_prefix(hdu.size, 'B')}, the file has {there}")
+                for card in hdu.header["TUNIT*"].values() if "TFIELDS" in hdu.header else ():
+                    _must_be_plain(path, str(card))
                 if chosen is None and isinstance(hdu, fits.BinTableHDU | fits.TableHDU) and _has_positions(hdu):
                     chosen = hdu
                 elif hdu.size:
@@ -67,7 +69,9 @@ def _columns(path: Path, found: Any, freq_hz: float | None = None) -> Table:
         column = columns[meaning] = Column(top.names[k], top.units[meaning])
         values = found[top.names[k]]
         if getattr(values, "ndim", 1) != 1:
-            raise broken(path, None, f"column '{harmless(column.name, SHOWN)}' holds arrays; one number a source is read")
+            raise broken(
+                path, None, f"column '{harmless(column.name, SHOWN)}' holds arrays; one number a source is read"
+            )
         if KEPT[meaning] is None:
             column.texts = tuple("" if np.ma.is_masked(x) else str(x).strip() for x in values)
         else:
@@ -89,6 +93,11 @@ def _numbers_of(path: Path, column: Column, values: Any, hours: bool) -> None:
     column.numbers = np.array(
         [entry(path, column, k, "" if masked[k] else str(x).strip(), k + 1, "row", hours) for k, x in enumerate(data)]
     )
+
+
+def _must_be_plain(path: Path, unit: str) -> None:
+    if not plain_unit(unit):
+        raise broken(path, None, f"'{harmless(unit, SHOWN)}' is no unit that is read; write it like mJy or arcsec")
 
 
 def _has_positions(hdu: Any) -> bool:
@@ -131,6 +140,7 @@ def _look_through(path: Path, raw: bytes) -> None:
         if tag == "COOSYS":
             systems.append(f"{marks.get('system', '')} {marks.get('equinox', '')}".upper())
         if tag == "FIELD":
+            _must_be_plain(path, marks.get("unit", ""))
             sizes = [int(n[:9]) for n in re.findall(r"\d+", marks.get("arraysize", "")[:99])]
             cells += 1 + max(sizes, default=0) * (1 if len(sizes) < 2 else max(sizes))
         if tag == "TR":

@@ -158,7 +158,7 @@ def meaning_of(column: str, survey: Survey | None = None) -> tuple[str | None, s
     if name in KNOWN:
         return KNOWN[name], unit or WITHIN_NAME.get(name)
     base, _, suffix = name.rpartition("_")
-    if base in KNOWN and suffix in SUFFIXES:
+    if base in KNOWN and suffix in SUFFIXES and unit in (None, SUFFIXES[suffix]):
         return KNOWN[base], SUFFIXES[suffix]
     return None, unit
 

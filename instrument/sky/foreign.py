@@ -13,23 +13,24 @@ from instrument.sky.bbs_text import broken
 from instrument.sky.points import PointSky
 
 TABLE = "write its sources as BBS text or as a table of named columns"
-# name of the format: what its text begins with or holds, and the way out
+# name of the format, what a comment or the first line of data begins with, and the way out
 TEXTS: tuple[tuple[str, str, str], ...] = (
-    ("an AO sky model (skymodel fileformat, of mwa-reduce)", r"\s*skymodel fileformat", TABLE),
-    ("a source list of RTS or WODEN", r"(?m)\A(?:\s*(?:#.*)?\n)*SOURCE\s+\S+\s+(?:P\s|[\d.])", TABLE),
+    ("an AO sky model (skymodel fileformat, of mwa-reduce)", r"skymodel fileformat", TABLE),
+    ("a source list of RTS or WODEN", r"source\s+\S+\s+(?:p\s|[\d.])", TABLE),
     (
         "a SAGECal sky model",
-        r"(?im)\A##\s*LSM file|^#+\s*name\s*\|?\s*(?:h\s+m\s+s|ra\s*\()|"
-        r"\A(?:\s*(?:#.*)?\n)*\s*\S+(?:\s+[+-]?\d+){2}\s+[\d.]+(?:\s+[+-]?\d+){2}\s+[\d.]+(?:\s+[-+.\deE]+){7,}\s*$",
+        r"##\s*lsm file|#+\s*name\s*\|?\s*(?:h\s+m\s+s|ra\s*\()|"
+        r"\S+(?:\s+[+-]?\d+){2}\s+[\d.]+(?:\s+[+-]?\d+){2}\s+[\d.]+(?:\s+[-+.\de]+){7}",
         "SAGECal's convert_skymodel.py --lsmtobbs writes BBS text (its spectral terms are of natural logarithms: "
         "multiply the second by ln 10, the third by its square)",
     ),
-    ("a Tigger sky model", r"(?im)\A#\s*format\s*:|tigger", "tigger-convert writes its columns as text: " + TABLE),
-    ("a ds9 region file", r"\A# Region file format", "it holds no fluxes; " + TABLE),
-    ("a hyperdrive source list", r"(?m)^-?\s*(?:ra|flux_type|comp_type)\s*:", TABLE),
-    ("JSON or YAML", r"\A\s*(?:[\[{]\s*[\"{\n]|---\s)", TABLE),
-    ("a web page", r"(?i)\A\s*<(?:!doctype html|html)", "fetch the table itself"),
+    ("a Tigger sky model", r"#\s*format\s*:|<.*\btigger\b", "tigger-convert writes its columns as text: " + TABLE),
+    ("a ds9 region file", r"# region file format", "it holds no fluxes; " + TABLE),
+    ("a hyperdrive source list", r"-?\s*(?:ra|flux_type|comp_type)\s*:", TABLE),
+    ("JSON or YAML", r"[\[{]\s*(?:[\"{]|$)|---(?:\s|$)", TABLE),
+    ("a web page", r"<(?:!doctype html|html)", "fetch the table itself"),
 )
+BELOW_A_FIRST_LINE = ("a Tigger sky model", "a hyperdrive source list")
 BINARY: tuple[tuple[str, bytes, str], ...] = (
     ("an HDF5 file (pyradiosky's .skyh5?)", b"\x89HDF", "pyradiosky's write_text_catalog writes a table that is read"),
     ("a zip archive", b"PK\x03\x04", "unpack it"),
@@ -45,9 +46,14 @@ def refuse_foreign(path: Path, raw: bytes) -> None:
     for title, start, remedy in BINARY:
         if raw.startswith(start):
             raise broken(path, None, f"is {title}, which is not read here; {remedy}")
-    head = raw[:4096].decode("utf-8", errors="replace")
+    # of each line the first 200 characters: enough to tell, and no pattern can take long over them
+    lines = [t.strip()[:200] for t in raw[:4096].decode("utf-8", errors="replace").split("\n")]
+    written = [t for t in lines if t]
+    first = next((k for k, t in enumerate(written) if not t.startswith("#")), len(written))
     for title, pattern, remedy in TEXTS:
-        if re.search(pattern, head):
+        # the lines below the first hold data in a table too
+        looked_at = written[: first + (4 if title in BELOW_A_FIRST_LINE else 1)]
+        if any(re.match(pattern, t, re.IGNORECASE) for t in looked_at):
             raise broken(path, None, f"is {title}, which is not read here; {remedy}")
 
 
@@ -78,7 +84,9 @@ def read_oskar(path: Path, raw: bytes) -> PointSky:
     still = data["ref_freq"] <= 0
     if np.any(still & ((data["spectral_index"] != 0) | (data["rotation_measure"] != 0))):
         where = [f"line {lines[k]}" for k in np.flatnonzero(still & (data["spectral_index"] != 0))[:20]]
-        unused(harmless(path.name), where or ["rotation measures"], "spectra and rotation without a reference frequency")
+        unused(
+            harmless(path.name), where or ["rotation measures"], "spectra and rotation without a reference frequency"
+        )
     freq = np.where(still, 150e6, data["ref_freq"])
     index, turn = (np.where(still, 0.0, data[m]) for m in ("spectral_index", "rotation_measure"))
     arcsec = np.pi / 180 / 3600

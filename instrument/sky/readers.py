@@ -80,11 +80,12 @@ def read(
     if b"<VOTABLE" in raw[:4096].upper() or b":VOTABLE" in raw[:4096].upper():
         return sky_of(votable(file, raw), choices)
     name = file.name.lower().removesuffix(".gz")
-    if not name.endswith(BBS_SUFFIXES):
+    of_bbs = is_bbs(_head(raw))
+    if not of_bbs:
         refuse_foreign(file, raw)
     if name.endswith(".osm"):
         return read_oskar(file, raw)
-    if b"\0" not in raw[:4096] and (name.endswith(BBS_SUFFIXES) or is_bbs(_head(raw))):
+    if b"\0" not in raw[:4096] and (name.endswith(BBS_SUFFIXES) or of_bbs):
         return read_bbs(file, _lines(file, raw), told.centre)
     return sky_of(text_table(file, raw), choices)
 
@@ -98,8 +99,8 @@ def _find(path: Any) -> Path:
     if os.path.lexists(file):
         if (file / "table.dat").is_file():
             raise FileError(
-                f"'{harmless(path)}' is a CASA table, which is not read as a sky; write its sources as BBS text or as a "
-                "table of named columns"
+                f"'{harmless(path)}' is a CASA table, which is not read as a sky; write its sources as BBS text or "
+                "as a table of named columns"
             )
         return file
     carried = {f.name: f for f in files("instrument.data").iterdir() if f.name.endswith((".skymodel", ".csv"))}

@@ -12,17 +12,14 @@ from instrument.files_in import SHOWN, harmless
 from instrument.sky.bbs_text import broken
 from instrument.sky.columns import FITTED_BESIDE, KEPT, MEANINGS, bare, default_unit
 from instrument.sky.points import PointSky
-from instrument.sky.tables import Column, Table, say, say_unread
+from instrument.sky.tables import Column, Table, say, say_unread, unit_scale
 from instrument.units import Float
 
-# values that catalogues write where they have none; an angle of -99 deg may be meant
-PLACEHOLDERS = (-99.0, -999.0, -9999.0, -99999.0, 999.0, 9999.0, 99999.0)
-MAY_BE_MEANT = {"ra": (-99.0,), "fit_angle": (-99.0,), "angle": (-99.0,), "true_angle": (-99.0,)}
-MAY_BE_MEANT |= {"rotation_measure": (-99.0, 999.0), "i": PLACEHOLDERS[4:], "fallback_i": PLACEHOLDERS[4:]}
-MAY_BE_MEANT |= {"ref_freq": PLACEHOLDERS[4:], "major": PLACEHOLDERS[4:], "minor": PLACEHOLDERS[4:]}
-MAY_BE_MEANT |= {"fit_major": PLACEHOLDERS[4:], "fit_minor": PLACEHOLDERS[4:]}
-HAVE_NO_EFFECT = ("q", "u", "v", "spectral_index", "spectral_curvature", "rotation_measure", "major", "minor")
-HAVE_NO_EFFECT += ("fit_major", "fit_minor", "angle", "true_angle", "fit_angle")
+# values that catalogues write where they have none; an angle or a rotation measure of -99 may be meant
+PLACEHOLDERS = (-999.0, -9999.0, -99999.0)
+HAVE_NO_EFFECT = (
+    "q", "u", "v", "spectral_index", "spectral_curvature", "rotation_measure", "major", "minor", "angle",
+)  # fmt: skip
 ARCSEC = np.pi / 180 / 3600
 Sizes = Literal["as given", "points"]
 Incomplete = Literal["refuse", "leave out", "no effect"]
@@ -67,9 +64,7 @@ def sky_of(table: Table, choices: Choices) -> PointSky:
 def _values(table: Table, meaning: str, column: Column) -> Float:
     """A column in the unit its meaning is kept in, NaN where there is nothing; placeholders count as nothing."""
     found = np.array(column.numbers)
-    for placeholder in PLACEHOLDERS:
-        if placeholder in MAY_BE_MEANT.get(meaning, ()):
-            continue
+    for placeholder in _placeholders(meaning):
         there = np.flatnonzero(found == placeholder)
         if len(there):
             column.missing[int(there[0])] = f"{placeholder:g}, which stands for 'no data'"
@@ -81,10 +76,14 @@ def _values(table: Table, meaning: str, column: Column) -> Float:
     return np.asarray(scale * found)
 
 
+def _placeholders(meaning: str) -> tuple[float, ...]:
+    if "angle" in meaning or meaning in ("ra", "rotation_measure"):
+        return PLACEHOLDERS
+    return (*PLACEHOLDERS, -99.0, *((999.0, 9999.0, 99.0) if meaning.startswith("spectral") else ()))
+
+
 def _scale(table: Table, meaning: str, column: Column) -> float:
     """Factor from the unit of a column to the one its meaning is kept in."""
-    from astropy import units as u
-
     kept, name = KEPT[meaning] or "", harmless(column.name, SHOWN)
     unit = column.unit or default_unit(table.survey, meaning)
     if unit is None:
@@ -93,11 +92,11 @@ def _scale(table: Table, meaning: str, column: Column) -> float:
         stem = bare(column.name)[0]
         example = {"rad": f"{stem}_deg or {stem}_arcsec", "Jy": f"{stem}_jy", "Hz": f"{stem}_hz"}[kept]
         raise broken(table.path, None, f"column '{name}' has no unit; name it like {example}")
-    try:
-        return float(u.Unit(unit[:40]).to(kept))
-    except (ValueError, TypeError, u.UnitConversionError):
-        wanted, shown = kept or "no unit", harmless(unit, SHOWN)
-        raise broken(table.path, None, f"column '{name}' is in '{shown}', which is not convertible to {wanted}") from None
+    scale = unit_scale(unit, kept)
+    if scale is None:
+        why = f"'{harmless(unit, SHOWN)}', which is not convertible to {kept or 'no unit'}"
+        raise broken(table.path, None, f"column '{name}' is in {why}")
+    return scale
 
 
 # Sizes -----------------------------------------------------------------------------------------------------------
@@ -137,7 +136,9 @@ def _without_beam(
             limits = table.columns.get(f"limit_{axis}")
             if limits is not None and limits.texts is not None:
                 found[axis] = np.where([t == "<" for t in limits.texts], 0.0, found[axis])
-        return found  # such sizes are deconvolved already, and what is only a limit is none
+        unangled = (found["major"] == found["minor"]) & ~np.isfinite(found["angle"])
+        # such sizes are deconvolved already, and what is only a limit is none
+        return {**found, "angle": np.where(unangled, 0.0, found["angle"])}
     if choices.sizes == "as given":
         return found
     if title in ("NVSS", "VLSS"):
@@ -158,8 +159,8 @@ def _without_beam(
         fitted = title is not None or any(n.startswith(FITTED_BESIDE) for n in beside)
         if fitted:
             raise broken(
-                table.path, None, f"{names[0]}, {names[1]} are sizes fitted to an image, which hold its beam, and there "
-                "are no deconvolved ones (DC_Maj, DC_Min); say sizes='points', sizes='as given', or beam='6 arcsec'"
+                table.path, None, f"{names[0]}, {names[1]} are sizes fitted to an image, which hold its beam, and "
+                "there are no deconvolved ones (DC_Maj); say sizes='points', sizes='as given', or beam='6 arcsec'"
             )  # fmt: skip
         say(
             table, f"{names[0]}, {names[1]} are taken as sizes of the sources themselves; if they hold the beam of an "
@@ -264,8 +265,8 @@ def _frequency(table: Table, values: dict[str, Float], choices: Choices) -> None
         if meaning in values:
             known_names = ", ".join(MEANINGS["ref_freq"][1][:4])
             raise broken(
-                table.path, None, f"column {meaning} needs a column ref_freq ({known_names}), or frequency='150 MHz' of "
-                "the fluxes"
+                table.path, None, f"column {meaning} needs a column ref_freq ({known_names}), or frequency='150 MHz' "
+                "of the fluxes"
             )  # fmt: skip
 
 

@@ -99,23 +99,35 @@ def _rank(name: str, survey: Survey | None) -> int:
     return -1 if survey and name in survey.columns else names.index(name) if name in names else len(names)
 
 
+def plain_unit(unit: str) -> bool:
+    """Whether a unit from outside is one that may be parsed: astropy works out 10**99999999 Jy, digit by digit."""
+    return len(unit) <= 40 and not re.search(r"\d{4}|(?:\*\*|\^)\s*[({[]*\s*[+-]?\s*\d{2}", unit)
+
+
+def unit_scale(unit: str, kept: str) -> float | None:
+    """Factor from a unit to another; `None` where there is none."""
+    from astropy import units as u
+
+    try:
+        scale = float(u.Unit(unit).to(kept)) if plain_unit(unit) else np.nan
+    except (ValueError, TypeError, OverflowError, u.UnitConversionError):
+        return None
+    return scale if np.isfinite(scale) and scale > 0 else None
+
+
 def _one_unit(path: Path, column: str, given: str | None, within: str | None) -> str | None:
     """The unit of a column: of the table, or of its name; raises `FileError` when they differ."""
     if not (given and within):
         return given or within
-    from astropy import units as u
-
-    try:
-        same = bool(np.isclose(float(u.Unit(given[:40]).to(within[:40])), 1.0, rtol=1e-12))
-    except (ValueError, TypeError, u.UnitConversionError):
-        same = False
-    if not same:
+    scale = unit_scale(given, within)
+    if scale is None or not np.isclose(scale, 1.0, rtol=1e-12):
         name, unit = harmless(column, SHOWN), harmless(given, SHOWN)
         raise broken(path, None, f"column '{name}' is in '{unit}' by its unit but not by its name; rename it")
     return given
 
 
 def number_of(text: str) -> float | None:
+    """Text as a number; `None` where it is none (Python's 1_000 is none to anybody else)."""
     try:
         return None if "_" in text else float(text)
     except ValueError:

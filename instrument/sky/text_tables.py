@@ -20,6 +20,7 @@ from instrument.sky.tables import ROWS_AT_MOST, Column, Heading, Table, entry, f
 FREQUENCY = re.compile(r"#.*reference frequency.*?([\d.]+(?:e[+-]?\d+)?)\s*([kmg]?hz)", re.IGNORECASE)
 EQUINOX = re.compile(r"#\s*equinox\s*:?\s*([\d.]+)", re.IGNORECASE)
 
+
 def text_table(path: Path, raw: bytes) -> Table:
     """CSV (also with tabs, semicolons, bars or blanks), or ECSV when its first line says so; complaints have a line."""
     if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
@@ -94,7 +95,7 @@ def _splitter(path: Path, delimiter: str) -> Callable[[int, str], list[str]]:
         try:
             if delimiter == " " and '"' not in line:
                 return line.split()
-            return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
+            return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True, strict=True))
         except (csv.Error, StopIteration) as error:  # a NUL, a field of more than 128 kB
             raise broken(path, number, f"not a row of a table: {error or 'nothing in it'}") from None
 
@@ -143,7 +144,9 @@ def _ecsv_header(path: Path, comments: list[str]) -> tuple[dict[str, str], str]:
     return units, delimiter
 
 
-def _text_rows(path: Path, rest: Iterable[tuple[int, str]], split: Callable[[int, str], list[str]], top: Heading) -> Table:
+def _text_rows(
+    path: Path, rest: Iterable[tuple[int, str]], split: Callable[[int, str], list[str]], top: Heading
+) -> Table:
     columns = {m: Column(top.names[k], top.units[m]) for m, k in top.chosen.items()}
     numbers = {m: array("d") for m in columns if KEPT[m] is not None}
     texts: dict[str, list[str]] = {m: [] for m in columns if KEPT[m] is None}
@@ -161,9 +164,7 @@ def _text_rows(path: Path, rest: Iterable[tuple[int, str]], split: Callable[[int
             if meaning in texts:
                 texts[meaning].append(row[k].strip())
             else:
-                value = entry(
-                    path, columns[meaning], len(where), row[k].strip(), number, "line", meaning == "ra"
-                )
+                value = entry(path, columns[meaning], len(where), row[k].strip(), number, "line", meaning == "ra")
                 numbers[meaning].append(value)
         where.append(number)
     for meaning, column in columns.items():
