@@ -21,7 +21,8 @@ def channel_noise(
     at the brightest depth, and take little of others near it. A depth that noise might have made is left alone: there
     the differences would find 5 % too little in 33 channels. The median over pixels is not moved by the few where
     more is taken. Each difference is weighed as if the variance went with 1 / weight: right for such weights, and
-    for any that change slowly from channel to channel. NaN where there are fewer than three channels, or no pixel with data.
+    for any that change slowly from channel to channel. NaN where there are fewer than three channels, or no pixel with
+    data.
     """
     order = np.argsort(lambda2, kind="stable")
     x, w = lambda2[order], weights[order]

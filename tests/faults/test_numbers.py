@@ -147,7 +147,7 @@ def test_i2_no_text_imports_a_module(tag, text):
     import sys
 
     before = set(sys.modules)
-    with pytest.raises(InputError, match="is called|must name a class|has no 'component'"):
+    with pytest.raises(InputError, match=r"is called|must name a class|has no 'component'"):
         Component.from_json(f'{{"{tag}": "{text}"}}')
     assert {"antigravity", "this"} & (set(sys.modules) - before) == set()
 
