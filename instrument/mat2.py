@@ -10,6 +10,7 @@ from instrument.units import Complex, Float
 
 IDENTITY: Complex = np.eye(2, dtype=complex)
 IDENTITY.setflags(write=False)
+UNIT = 2.0**-53  # no operation of float64 is wrong by more, relative to its result
 
 
 def pack(a: Any, b: Any, c: Any, d: Any) -> Complex:

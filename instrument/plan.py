@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from instrument.errors import InputError, RefusedError
+from instrument.check import BY_STATIONS, DEFINITION, SHARE, Check, Checker, not_checked, watch
+from instrument.errors import RefusedError
 from instrument.predict.base import Predictor, Problem, Work
+from instrument.predict.direct import Direct
+from instrument.predict.threads import predict
 from instrument.units import si_prefix
 from instrument.visibilities import Visibilities
 
@@ -22,30 +25,6 @@ class Item(NamedTuple):
     name: str
     reason: str
     bound: float = 0.0
-
-
-@dataclass(frozen=True)
-class Check:
-    """What `verify` measured: the largest error of `samples` visibilities against `direct`, and the bound promised.
-
-    Both relative to `scale_jy`, the total flux of the sky.
-    """
-
-    error: float
-    bound: float
-    samples: int
-    scale_jy: float
-
-    @property
-    def passed(self) -> bool:
-        """Whether the measured error lies within the bound."""
-        return bool(self.error <= self.bound)
-
-    def __str__(self) -> str:
-        verdict = "within" if self.passed else "ABOVE"
-        return (
-            f"error {self.error:.1e}, {verdict} the bound {self.bound:.1e} ({self.samples} visibilities against direct)"
-        )
 
 
 @dataclass(frozen=True)
@@ -70,11 +49,20 @@ class Plan:
     bounds: tuple[Item, ...]
     scale_jy: float
     seconds: float = field(compare=False, default=0.0)
+    checker: Checker | None = field(compare=False, repr=False, default=None)  # sees the blocks as they pass
 
     @property
     def error_bound(self) -> float:
         """Sum of the bounds on all errors, relative to the total flux of the sky."""
-        return sum(item.bound for item in (*self.left_out, *self.bounds))
+        return self.sum_bound + sum(item.bound for item in self.not_modelled)
+
+    @property
+    def sum_bound(self) -> float:
+        """That on what is computed against its definition, `direct` on the scene as given: what `verify` holds.
+
+        What is not modelled is no part of it: the definition leaves it out as well.
+        """
+        return sum(item.bound for item in (*self.kept, *self.left_out, *self.bounds))
 
     @property
     def slices(self) -> list[tuple[slice, slice]]:
@@ -98,15 +86,20 @@ class Plan:
         lines = [head]
         lines += [f"kept          {i.name:<22} {i.reason}" for i in self.kept]
         lines += [f"left out      {i.name:<22} {i.reason:<46} error {i.bound:.2g}" for i in self.left_out]
-        lines += [f"not modelled  {i.name:<22} {i.reason}" for i in self.not_modelled]
+        lines += [
+            f"not modelled  {i.name:<22} {i.reason:<46}{f' error {i.bound:.2g}' if i.bound else ''}".rstrip()
+            for i in self.not_modelled
+        ]
         lines.append(
             f"engine        {self.engine_name:<22} {si_prefix(self.work.flops, 'Flop')}, "
             f"about {_seconds(self.seconds)}, peak {si_prefix(self.memory, 'B')} "
             f"in {count_of(len(self.slices), 'block')}"
         )
         lines += [f"refused       {i.name:<22} {i.reason}" for i in self.refused]
-        inside = ", ".join(f"{i.name} {i.bound:.1e}" for i in (*self.left_out, *self.bounds) if i.bound)
-        lines.append(f"bound         {self.error_bound:.1e} of the total flux {self.scale_jy:.4g} Jy ({inside})")
+        every = (*self.kept, *self.left_out, *self.bounds, *self.not_modelled)
+        inside = ", ".join(f"{i.name} {i.bound:.1e}" for i in every if i.bound)
+        above = ", ABOVE the tolerance" if 0 < self.tolerance < self.error_bound else ""
+        lines.append(f"bound         {self.error_bound:.1e} of the total flux {self.scale_jy:.4g} Jy ({inside}){above}")
         return "\n".join(lines)
 
     def run(self, executor: Executor | None = None, progress: Callable[[float], None] | None = None) -> Visibilities:
@@ -140,9 +133,7 @@ class Plan:
         if executor is not None:
             yield from self._stream(executor, 2 * self.workers, progress)
             return
-        from threadpoolctl import threadpool_limits
-
-        with threadpool_limits(1), ThreadPoolExecutor(self.workers) as pool:
+        with ThreadPoolExecutor(self.workers) as pool:
             yield from self._stream(pool, self.workers, progress)
 
     def _stream(
@@ -154,9 +145,11 @@ class Plan:
         try:
             while todo or waiting:
                 while todo and len(waiting) < ahead:
-                    waiting.append(executor.submit(self.engine.predict, self.problem.block(*todo.pop(0))))
+                    waiting.append(executor.submit(predict, self.engine, self.problem.block(*todo.pop(0))))
                 block = waiting.popleft().result()
                 done += 1
+                if self.checker is not None:
+                    self.checker.see(block, self.full)
                 if progress is not None:
                     progress(done / len(self.slices))
                 yield block
@@ -177,29 +170,35 @@ class Plan:
                 width_hz=block.width_hz,
             )
 
-    def verify(self, samples: int = 64, seed: int = 0) -> Check:
-        """Recompute random visibilities of the scene as it was given with `direct`, and compare.
+    def watched(self, samples: int = 64, seed: int = 0) -> Plan:
+        """The same plan, whose blocks are checked as they pass by; `check` says what was found."""
+        return replace(self, checker=self._checker(samples, seed))
 
-        Takes up to 8 baselines at each of samples/8 random times and channels.
+    @property
+    def check(self) -> Check:
+        """What the check of the blocks found so far."""
+        if self.checker is not None:
+            return self.checker.result()
+        return not_checked("nobody looked at the blocks", self.sum_bound, self.scale_jy)
+
+    def verify(
+        self, vis: Visibilities | Iterable[Visibilities] | None = None, samples: int = 64, seed: int = 0
+    ) -> Check:
+        """Hold what was produced, `vis` (visibilities or blocks of them), against the definition of the scene as given.
+
+        Times and channels at random, all their baselines: each once before any comes twice, as many as 4 % of
+        the planned time buy, `samples` visibilities at least. Without `vis` the engine makes them anew, cell by cell.
+        Raises `InputError` for data of another scene, or from which a beam has been taken out.
         """
-        from instrument.predict.direct import Direct
+        checker = self._checker(samples, seed)
+        if vis is not None:
+            return watch(checker, [vis] if isinstance(vis, Visibilities) else vis)
+        cells = (self.problem.block(slice(t, t + 1), slice(f, f + 1)) for t, f in checker.chosen())
+        return watch(checker, (predict(self.engine, cell) for cell in cells))
 
-        if samples < 1:
-            raise InputError(f"verify needs at least one sample, got {samples}")
-        rng = np.random.default_rng(seed)
-        times, channels, baselines = self.problem.shape
-        each = min(8, baselines, samples)
-        worst, count = 0.0, 0
-        while count < samples:
-            t, f = (slice(k, k + 1) for k in (rng.integers(times), rng.integers(channels)))
-            pick = np.sort(rng.choice(baselines, each, replace=False))
-            chosen = self.problem.antenna1[pick], self.problem.antenna2[pick]
-            fast = self.engine.sums(self.problem.block(t, f).between(*chosen))
-            slow = Direct().sums(self.full.block(t, f).between(*chosen))
-            worst = float(np.maximum(worst, np.abs(fast - slow).max()))  # max() would drop a NaN
-            count += each
-        error = worst / self.scale_jy if self.scale_jy else worst
-        return Check(error, self.error_bound, count, self.scale_jy)
+    def _checker(self, samples: int, seed: int) -> Checker:
+        against = BY_STATIONS if isinstance(self.engine, Direct) else DEFINITION
+        return Checker(self.full, self.scale_jy, self.sum_bound, SHARE * self.seconds, samples, seed, against)
 
 
 def count_of(n: int, what: str) -> str:

@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import os
-import warnings
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from instrument.errors import InputError, InstrumentWarning, RefusedError, did_you_mean
+from instrument.errors import InputError, RefusedError, did_you_mean, warn
 from instrument.jones.chain import Chain
 from instrument.model import Instrument, warn_outside_band
-from instrument.observe.directions import EARTH_RATE, LIGHT, separation
+from instrument.not_modelled import not_modelled
+from instrument.numbers import COUNT, TOLERANCE, UV_RANGE
+from instrument.observe.directions import LIGHT
 from instrument.observe.observation import Observation
 from instrument.observe.sampling import Sampling
 from instrument.plan import Item, Plan, count_of
 from instrument.predict.base import Predictor, Problem, Work
+from instrument.predict.rounding import known_gain, rounding, total_flux, unknown_peaks
 from instrument.registry import available, load
 from instrument.sky.base import Sky
+from instrument.sky.rounding import polarized
 from instrument.units import Bool, Float, si_prefix, to_si
 
 BLOCK_BYTES = 64e6
@@ -37,8 +40,9 @@ def make_plan(
     uv_range: tuple[float, float] | None = None,
 ) -> Plan:
     """Work out the plan of a scene; see `Scene.plan`."""
-    if not (np.isfinite(tolerance) and tolerance >= 0):
-        raise InputError(f"tolerance = {tolerance} must be a number not below 0")
+    tolerance = TOLERANCE.check(tolerance, "tolerance")
+    workers = (os.cpu_count() or 1) if workers is None else COUNT.check(workers, "workers")
+    uv_range = None if uv_range is None else UV_RANGE.check(uv_range, "uv_range")
     layout, chain = instrument.layout(), instrument.chain()
     sky = sky.about(observation.phase_centre)
     warn_outside_band(chain, observation.freq_hz)
@@ -47,30 +51,27 @@ def make_plan(
     _must_rise(at)
     a, b = layout.baselines
     full = Problem(at, chain, sky, a, b, observation.interval, observation.width_hz)
+    scale_jy = _scale(full)
     kept: list[Item] = []
     left_out: list[Item] = []
-    chain = _simplify_chain(chain, at, kept, left_out)
-    problem = _simplify_sky(full, chain, tolerance, left_out)
+    budget = Budget(tolerance, rounding(full, scale_jy)) if tolerance > 0 else Budget(0.0, 0.0)
+    chain = _simplify_chain(chain, at, budget, kept, left_out)
+    problem = _simplify_sky(full, chain, budget, left_out)
     problem = _within(problem, uv_range, left_out)
     kept.append(_w_term(problem))
-    found, label, refused = _choose(problem, engine)
+    found, label, bound, refused = _choose(problem, engine, budget)
     limit = _limit(memory)
-    workers = workers or os.cpu_count() or 1
     shape, work, peak = _blocks(found, problem, workers, limit)
-    rounding = _rounding(problem)
-    if 0 < tolerance < rounding:
-        warnings.warn(
-            f"tolerance = {tolerance:g} is below what float64 can promise here, {rounding:.1e}",
-            InstrumentWarning,
-            stacklevel=3,
-        )
+    rounded = Item(_rounding_name(problem), "", rounding(problem, scale_jy))
+    unmodelled = not_modelled(problem, scale_jy)
+    _say_what_exceeds(tolerance, rounded.bound, unmodelled)
     return Plan(
         name=name,
         full=replace(full, antenna1=problem.antenna1, antenna2=problem.antenna2),
         problem=problem,
         kept=tuple(kept),
         left_out=tuple(left_out),
-        not_modelled=tuple(_smearing(problem)),
+        not_modelled=tuple(unmodelled),
         engine=found,
         engine_name=label,
         refused=tuple(refused),
@@ -80,8 +81,8 @@ def make_plan(
         memory=peak,
         limit=limit,
         tolerance=tolerance,
-        bounds=(Item(_rounding_name(problem), "", rounding),),
-        scale_jy=_total_flux(full),
+        bounds=(Item(label, "", bound), rounded) if bound else (rounded,),
+        scale_jy=scale_jy,
         seconds=work.seconds / workers,
     )
 
@@ -96,14 +97,54 @@ def _must_rise(at: Sampling) -> None:
         )
 
 
-def _simplify_chain(chain: Chain, at: Sampling, kept: list[Item], left_out: list[Item]) -> Chain:
-    smaller, fates = chain.simplified(at)
+class Budget:
+    """What a tolerance leaves for omissions after rounding; each is offered a part and takes what it needs."""
+
+    def __init__(self, tolerance: float, rounded: float) -> None:
+        self.left = max(0.0, tolerance - rounded)
+
+    def take(self, bound: float) -> None:
+        """Spend a bound."""
+        self.left = max(0.0, self.left - bound)
+
+
+def _scale(full: Problem) -> float:
+    """Total flux, to which all errors are relative; refused where float64 cannot hold products with it."""
+    scale_jy = total_flux(full)
+    if scale_jy and not 1e-250 < scale_jy < 1e250:
+        raise InputError(f"the sky has {scale_jy:.3g} Jy in all: give fluxes between 1e-250 and 1e250 Jy")
+    return scale_jy
+
+
+def _say_what_exceeds(tolerance: float, rounded: float, unmodelled: list[Item]) -> None:
+    if not tolerance:
+        return
+    extra = [i for i in unmodelled if i.bound]
+    if rounded > tolerance:
+        text = f"tolerance = {tolerance:g} is below what float64 can promise here, {rounded:.1e}"
+        warn(text)
+    elif rounded + sum(i.bound for i in extra) > tolerance:
+        said = "; ".join(f"{i.name}: {i.reason}, {i.bound:.1e}" for i in extra)
+        text = f"tolerance = {tolerance:g} is not kept by what is not modelled ({said}): split it into smaller sources"
+        warn(text)
+
+
+def _simplify_chain(chain: Chain, at: Sampling, budget: Budget, kept: list[Item], left_out: list[Item]) -> Chain:
+    gain = known_gain(chain, at)
+    # n terms each wrong by d of their peak change J B J^H by (1 + d)^2n - 1 of its own: half of what is left
+    share = 0.5 * budget.left / gain if gain else 0.0
+    smaller, fates = chain.simplified(at, float(np.expm1(np.log1p(share) / (2 * max(len(chain.terms), 1)))))
+    grown = 1.0
     for term, fate in fates:
         name = type(term).__name__
+        bound = gain * grown * fate.bound * (2 + fate.bound)
+        grown *= (1 + fate.bound) ** 2
+        budget.take(bound)
         if fate.term is None:
-            left_out.append(Item(name, fate.reason, fate.bound))
+            left_out.append(Item(name, fate.reason, bound))
         else:
-            kept.append(Item(name, fate.reason or ", ".join(p.sharing(at) for p in reversed(fate.term.parts()))))
+            shared = ", ".join(p.sharing(at) for p in reversed(fate.term.parts()))
+            kept.append(Item(name, fate.reason or shared, bound))
     if not smaller.parts:
         left_out.append(Item("2x2 algebra", "the chain is the identity"))
     elif smaller.structure != "full":
@@ -111,7 +152,7 @@ def _simplify_chain(chain: Chain, at: Sampling, kept: list[Item], left_out: list
     return smaller
 
 
-def _simplify_sky(full: Problem, chain: Chain, tolerance: float, left_out: list[Item]) -> Problem:
+def _simplify_sky(full: Problem, chain: Chain, budget: Budget, left_out: list[Item]) -> Problem:
     """Drop directions that give exactly nothing, and with a tolerance the faintest, by flux times the peak of |J|^2."""
     sky = full.sky.sources()
     if sky is None:
@@ -121,7 +162,7 @@ def _simplify_sky(full: Problem, chain: Chain, tolerance: float, left_out: list[
     if not use.all():
         left_out.append(Item(count_of(int((~use).sum()), "direction"), "no flux"))
     if chain.blind_below_horizon:
-        risen = _ever_up(full.at)
+        risen = full.at.rising.highest > -1e-9  # on the safe side: a direction at the very edge is kept
         if np.any(use & ~risen):
             below = count_of(int((use & ~risen).sum()), "direction")
             left_out.append(Item(below, "below the antenna planes throughout"))
@@ -131,9 +172,10 @@ def _simplify_sky(full: Problem, chain: Chain, tolerance: float, left_out: list[
         left_out.append(Item(f"{', '.join(zero)} of the sky", "zero in every direction"))
     if not use.any():
         raise InputError("nothing of the sky is ever above the antenna planes, or it has no flux at all")
-    if tolerance > 0:
-        faint, bound = _faint(stokes, use, chain.peak(full.at) ** 2, tolerance)
+    if budget.left > 0:
+        faint, bound = _faint(stokes, use, chain.peak(full.at), 0.5 * budget.left)
         if faint.any():
+            budget.take(bound)
             left_out.append(Item(count_of(int(faint.sum()), "faint direction"), "flux times the peak of |J|^2", bound))
             use &= ~faint
     if use.all():
@@ -142,15 +184,15 @@ def _simplify_sky(full: Problem, chain: Chain, tolerance: float, left_out: list[
     return replace(full, chain=chain, sky=smaller, at=full.at.towards(*smaller.directions()))
 
 
-def _faint(stokes: Float, use: Bool, gain: float, tolerance: float) -> tuple[Bool, float]:
-    """The faintest sources whose sum stays below half the tolerance (the rest is for rounding), and that sum."""
-    flux = np.abs(stokes[..., 0]) + np.sqrt((stokes[..., 1:] ** 2).sum(axis=-1))
-    share = gain * (flux / flux.sum(axis=1).max()).max(axis=0)
+def _faint(stokes: Float, use: Bool, peak: float, tolerance: float) -> tuple[Bool, float]:
+    """The faintest sources whose sum stays below a tolerance, and that sum."""
+    flux = np.abs(stokes[..., 0]) + polarized(stokes)
+    share = peak * (peak * flux / flux.sum(axis=1).max()).max(axis=0)
     faint = np.zeros(len(use), bool)
-    if not np.isfinite(gain):
+    if not np.isfinite(peak):
         return faint, 0.0
     order = np.argsort(np.where(use, share, np.inf), kind="stable")[: int(use.sum()) - 1]
-    dropped = order[np.cumsum(share[order]) <= 0.5 * tolerance]
+    dropped = order[np.cumsum(share[order]) <= tolerance]
     faint[dropped] = True
     return faint, float(share[dropped].sum())
 
@@ -182,21 +224,8 @@ def _w_term(problem: Problem) -> Item:
     return Item("w-term", f"without it phases could be wrong by {turns:.2g} turns")
 
 
-def _ever_up(at: Sampling) -> Bool:
-    """Which directions (S,) are above the antenna plane of any station at any time."""
-    first, _ = at.layout.frames
-    up = np.zeros(len(at.ra_rad), bool)
-    normals = at.layout.axes[first, 2]
-    for t in range(0, len(at.earth), 256):
-        earth = at.earth[t : t + 256]
-        toward = np.einsum("tij,gi->tgj", earth.matrices, normals).reshape(-1, 3)  # normals in ICRS
-        shift = np.einsum("tgj,tj->tg", toward.reshape(len(earth), -1, 3), earth.velocity).reshape(-1)
-        # 1e-9 on the safe side: a direction at the very edge is kept
-        up |= np.any(toward @ at.vectors.T + shift[:, None] > -1e-9, axis=0)
-    return up
-
-
-def _choose(problem: Problem, name: str | None) -> tuple[Predictor, str, list[Item]]:
+def _choose(problem: Problem, name: str | None, budget: Budget) -> tuple[Predictor, str, float, list[Item]]:
+    """The cheapest engine, prepared: with its name, the bound on its own error, and the engines that refuse."""
     plugins = available("engines")
     if name is not None and name not in plugins:
         raise InputError(f"no engine is called '{name}': {did_you_mean(name, plugins)}")
@@ -216,7 +245,8 @@ def _choose(problem: Problem, name: str | None) -> tuple[Predictor, str, list[It
         reasons = "; ".join(f"{i.name}: {i.reason}" for i in refused if name in (None, i.name))
         raise RefusedError(f"no engine serves this scene ({reasons})")
     _, label, engine = min(chosen, key=lambda entry: entry[0])
-    return engine, label, refused
+    prepared = engine.prepare(problem, budget.left)
+    return prepared.engine, label, prepared.bound, refused
 
 
 def _limit(memory: Any) -> float:
@@ -253,44 +283,7 @@ def _blocks(engine: Predictor, problem: Problem, workers: int, limit: float) -> 
     return shape, whole, workers * held + workers * result * shape[0] * shape[1]
 
 
-def _smearing(problem: Problem) -> list[Item]:
-    """The size of what is not modelled: averaging within a channel and an integration."""
-    far = float(np.sin(np.minimum(separation(problem.at.vectors, problem.at.centre).max(), np.pi / 2)))
-    longest = problem.at.layout.longest_m
-    parts = []
-    turns = EARTH_RATE * problem.interval_s * longest * float(problem.at.freq_hz.max()) / LIGHT * far
-    parts.append(f"time {_percent(1 - np.sinc(turns))}")
-    if problem.width_hz:
-        parts.append(f"bandwidth {_percent(1 - np.sinc(problem.width_hz * longest / LIGHT * far))}")
-    return [Item("smearing", f"{', '.join(parts)} of the farthest source lost on the longest baseline")]
-
-
-def _percent(lost: float) -> str:
-    return "all" if lost >= 0.995 else f"{100 * lost:.2g} %"
-
-
-def _rounding(problem: Problem) -> float:
-    """Bound on the rounding of float64 phases and sums, relative to the total flux."""
-    eps = float(np.finfo(float).eps)
-    reach = np.abs(problem.at.lmn).max(axis=0).sum() if len(problem.at.lmn) else 0.0
-    waves = problem.at.layout.longest_m * float(problem.at.freq_hz.max()) / LIGHT
-    peak = problem.chain.peak(problem.at)
-    gain = peak**2 if np.isfinite(peak) else 1.0  # the plan then says that it is assumed
-    # 4 roundings in each of two phases, and 4 of direction cosines, which are good to eps of 1 and not of themselves;
-    # 30 in the Jones matrices; the sum itself over S sources, worst case. Gains above 1 amplify it
-    largest = max(1.0, gain)
-    return largest * eps * (2 * np.pi * (8 * waves * float(reach) + 4 * waves) + 30 + problem.at.shape[3])
-
-
 def _rounding_name(problem: Problem) -> str:
     """What the bound on rounding is of, and what it takes for granted where a term knows no bound of its own."""
-    unknown = [type(t).__name__ for t in problem.chain.parts if not np.isfinite(t.peak(problem.at))]
+    unknown = unknown_peaks(problem)
     return f"float64 sums where {', '.join(unknown)} stays below 1:" if unknown else "float64 sums"
-
-
-def _total_flux(problem: Problem) -> float:
-    sky = problem.sky.sources()
-    if sky is None:
-        return float(np.abs(problem.sky.brightness(problem.at)).sum())
-    stokes = sky.stokes(problem.at.freq_hz)
-    return float((np.abs(stokes[..., 0]) + np.sqrt((stokes[..., 1:] ** 2).sum(axis=-1))).sum(axis=1).max())

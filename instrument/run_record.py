@@ -56,7 +56,7 @@ class Result:
         solved = solved and (self.calibration is None or self.calibration.passed)
         solved = solved and (self.sweep is None or self.sweep.passed)
         solved = solved and (self.products is None or self.products.passed)
-        return solved and (self.check is None or self.check.passed)
+        return solved and (self.check is None or not self.check.made or self.check.passed)
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
@@ -98,7 +98,9 @@ def record(result: Result, tables: dict[str, Any]) -> dict[str, Any]:
             "bound": result.check.bound,
             "samples": result.check.samples,
             "relative_to_jy": result.check.scale_jy,
-            "passed": result.check.passed,
+            "seen": {n: list(getattr(result.check, n)) for n in ("times", "channels", "stations", "baselines")},
+            "text": str(result.check),
+            "passed": result.check.passed if result.check.made else None,
         }
     if result.fluxes is not None:
         out["checks"]["photometry"] = {

@@ -150,7 +150,7 @@ class _Job:
         part = self.sky.select(rows)
         problem = replace(whole, chain=self.beams, sky=part, at=whole.at.towards(*part.directions()))
         times = max(d for d in range(1, self.slots + 1) if self.slots % d == 0 and d <= self.plan.block_shape[0])
-        return replace(self.plan, problem=problem, block_shape=(times, self.plan.block_shape[1]))
+        return replace(self.plan, full=problem, problem=problem, block_shape=(times, self.plan.block_shape[1]))
 
     def blocks(self) -> Iterator[tuple[float, Problem, list[Complex]]]:
         """Fraction done, coordinates of a block, and what is predicted of the shells in it, (T, F, B, 2, 2) each."""

@@ -132,7 +132,7 @@ class _Job:
         whole, part = self.plan.problem, self.sky.select(rows)
         problem = replace(whole, chain=self.beams, sky=part, at=whole.at.towards(*part.directions()))
         times = max(d for d in range(1, self.slots + 1) if self.slots % d == 0 and d <= self.plan.block_shape[0])
-        return replace(self.plan, problem=problem, block_shape=(times, self.plan.block_shape[1]))
+        return replace(self.plan, full=problem, problem=problem, block_shape=(times, self.plan.block_shape[1]))
 
     def blocks(self) -> Iterator[tuple[float, Models]]:
         """Fraction done, and what is predicted of every cluster in a block."""

@@ -10,7 +10,7 @@ import numpy as np
 from instrument import mat2
 from instrument.component import Component
 from instrument.observe.sampling import Sampling
-from instrument.units import Complex
+from instrument.units import Complex, Float
 
 Basis = Literal["sky", "horizon", "feed"]
 Structure = Literal["scalar", "diagonal", "full"]
@@ -18,7 +18,10 @@ PerStation = Literal["shared", "frame", "own"]
 
 
 class Simplified(NamedTuple):
-    """What is left of a term for a scene: the term or `None`, why, and the bound on the relative error of J."""
+    """What is left of a term for a scene: the term or `None`, why, and a bound on the error of J.
+
+    The bound is relative to the largest matrix of the term.
+    """
 
     term: JonesTerm | None
     reason: str
@@ -65,6 +68,15 @@ class JonesTerm(Component):
             return float("inf")
         return float(np.nanmax(mat2.singular_values(self.jones(at))[0], initial=0.0))
 
+    def rounding(self, at: Sampling) -> Float:
+        """A bound on the rounding of J (largest singular value of the error), (S,), or (1,) for every direction.
+
+        64 roundings of the peak. A term that loses more says so: a phase of n turns is good to 2 pi n roundings. What
+        the azimuth loses near a zenith is counted elsewhere (`ElementBeam.jump`).
+        """
+        peak = self.peak(at)
+        return np.array([64 * mat2.UNIT * (peak if np.isfinite(peak) else 1.0)])
+
     def sharing(self, at: Sampling) -> str:
         """How many different matrices the stations of an array need of this term, in words."""
         if self.per_station == "own":
@@ -73,7 +85,7 @@ class JonesTerm(Component):
         return f"{type(self).__name__} shared by {'+'.join(str(n) for n in sorted(sizes, reverse=True))} stations"
 
     def simplify(self, at: Sampling, tolerance: float) -> Simplified:
-        """What a scene needs of this term: itself, something simpler, or nothing, with a bound on the error."""
+        """What a scene needs of this term: itself, something simpler, or nothing; its bound is below `tolerance`."""
         return Simplified(self, "", 0.0)
 
 
@@ -106,3 +118,12 @@ class ElementBeam(JonesTerm):
     def band_hz(self) -> tuple[float, float]:
         """Frequencies between which the model was made; outside it extrapolates."""
         return 0.0, float("inf")
+
+    def jump(self, at: Sampling) -> float:
+        """How fast the field seen by the receptors turns about the zenith, per rad of azimuth at a fixed direction.
+
+        0 for an antenna whose response is one smooth field there, as that of anything that stands still is; an
+        alt-azimuth mount turns once, its `peak` per rad. The cautious default is that of four turns.
+        """
+        peak = self.peak(at)
+        return 4 * (peak if np.isfinite(peak) else 1.0)

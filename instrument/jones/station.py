@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from pydantic import model_validator
 
+from instrument import mat2
 from instrument.component import Component
 from instrument.errors import InputError
 from instrument.jones.base import Basis, ElementBeam, JonesTerm, PerStation, ScalarTerm
@@ -73,6 +74,16 @@ class ArrayFactor(ScalarTerm):
     def peak(self, at: Sampling) -> float:
         """1: a mean of unit vectors."""
         return 1.0
+
+    def rounding(self, at: Sampling) -> Float:
+        """That of the phases of the outermost parts, and of the mean."""
+        out = 0.0
+        for level in self.levels:
+            turns = np.linalg.norm(level.offsets_m, axis=-1).max() / LIGHT
+            turns *= (at.freq_hz + (self.reference_frequency or at.freq_hz)).max()
+            # 18: those of two directions, their products with the frequencies, and three products with an offset
+            out += mat2.UNIT * (2 * np.pi * 18 * turns + 8 + level.offsets_m.shape[1])
+        return np.array([out])
 
     def sharing(self, at: Sampling) -> str:
         """How many different array factors there are."""

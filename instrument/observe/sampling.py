@@ -4,13 +4,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from instrument.observe.directions import EarthFrame, earth_frame, lmn, tangents
 from instrument.observe.layout import Layout
 from instrument.units import Direction, Float, unit_vectors
+
+
+class Rising(NamedTuple):
+    """Extremes of each direction over all times and stations, (S,): of the sine of its elevation and of its distance.
+
+    `zenith` is its least distance from a zenith or nadir and `horizon` its least from an antenna plane, as sines.
+    """
+
+    highest: Float
+    lowest: Float
+    zenith: Float
+    horizon: Float
 
 
 @dataclass(frozen=True)
@@ -123,6 +135,26 @@ class Sampling:
         rho = np.hypot(p, q)
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(rho > 0, p / rho, 1.0), np.where(rho > 0, q / rho, 0.0)
+
+    @cached_property
+    def rising(self) -> Rising:
+        """How high and how low each direction stands, and how near it comes to zenith and horizon; never (T, A, S)."""
+        count = len(self.ra_rad)
+        found = Rising(np.full(count, -1.0), np.full(count, 1.0), np.full(count, 1.0), np.full(count, 1.0))
+        first, _ = self.layout.frames
+        step = max(1, int(4e6 / (count * len(first))))  # 32 MB
+        for t in range(0, len(self.earth), step):
+            part = self.block(slice(t, t + step), slice(0, 1)).one_per_frame()
+            axes = part.layout.axes
+            up = part.itrf @ axes[:, 2].T  # (T, S, G)
+            np.maximum(found.highest, up.max(axis=(0, 2)), out=found.highest)
+            np.minimum(found.lowest, up.min(axis=(0, 2)), out=found.lowest)
+            np.minimum(found.horizon, np.abs(up).min(axis=(0, 2)), out=found.horizon)
+            aside = np.sqrt(np.maximum(1.0 - up**2, 0.0))
+            k, s, g = np.nonzero(aside < 1e-3)  # 1 - up^2 has lost 6 digits there, and all of them at the zenith
+            aside[k, s, g] = np.hypot(*np.einsum("nic,nc->in", axes[g, :2], part.itrf[k, s]))
+            np.minimum(found.zenith, aside.min(axis=(0, 2)), out=found.zenith)
+        return found
 
     @property
     def azimuth(self) -> Float:

@@ -24,6 +24,13 @@ class Work(NamedTuple):
     seconds: float
 
 
+class Prepared(NamedTuple):
+    """An engine as it will be run on a problem, and a bound on its own error, relative to the total flux."""
+
+    engine: Predictor
+    bound: float = 0.0
+
+
 @dataclass(frozen=True)
 class Problem:
     """What an engine is given: where and when (`at`, with the directions of the sky), the chain, the sky, baselines."""
@@ -58,6 +65,13 @@ class Predictor(Component):
     def refuses(self, problem: Problem) -> str | None:
         """Why this engine cannot serve a problem; `None` when it can."""
         return None
+
+    def prepare(self, problem: Problem, tolerance: float) -> Prepared:
+        """The engine for a whole problem, which it may approximate with an error of at most `tolerance`.
+
+        An exact engine is ready as it is. Blocks of the problem, of any times and channels, are then asked of `sums`.
+        """
+        return Prepared(self)
 
     @abstractmethod
     def work(self, problem: Problem) -> Work:

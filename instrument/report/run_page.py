@@ -137,22 +137,29 @@ def page_of_run(
         Section("To run it again", _again(record)),
     ]
     finished = record.get("finished", "").replace("T", " ")
-    short = [name for name, check in record.get("checks", {}).items() if not check.get("passed", True)]
+    verdicts = {name: check.get("passed", True) for name, check in record.get("checks", {}).items()}
+    short = [name for name, passed in verdicts.items() if passed is False]
+    unmade = [name for name, passed in verdicts.items() if passed is None]
     verdict = f"Done, but fell short: {', '.join(short)}." if short else "Done; every check held."
-    if not record.get("checks"):
+    if unmade and not short:
+        verdict = f"Done; not checked: {', '.join(unmade)}."
+    if not verdicts:
         verdict = "Done; nothing was checked."
     return Page(
         title=record.get("title") or record.get("name", "run"),
         subtitle=f"{record.get('kind', 'scene')} {record.get('name', '')}, finished {finished}",
         verdict=verdict,
-        mark="bad" if short else "good" if record.get("checks") else "",
+        mark="bad" if short else "good" if verdicts and not unmade else "",
         cards=_cards(record),
         sections=[section for section in sections if section.blocks],
         footer=f"instrument {record.get('versions', {}).get('instrument', '')}",
     )
 
 
-def _mark(passed: bool, good: str = "held", bad: str = "fell short") -> Cell:
+def _mark(passed: bool | None, good: str = "held", bad: str = "fell short") -> Cell | str:
+    """The verdict of a check; one that was not made, `None`, is neither held nor fell short."""
+    if passed is None:
+        return "not checked"
     return Cell(good if passed else bad, mark="good" if passed else "bad")
 
 
@@ -168,7 +175,7 @@ def _cards(record: Mapping[str, Any]) -> list[Card]:
             cards.append(
                 Card(f"{kind.capitalize()} leakage in 4°", f"{median}\u00a0%", f"median; at most {most}\u00a0%")
             )
-    if check := checks.get("prediction"):
+    if (check := checks.get("prediction")) and check.get("passed") is not None:
         note = f"of the {number(check['relative_to_jy'], 4)} Jy in the sky; bound {check['bound']:.1e}"
         cards.append(Card("Prediction error", f"{check['error']:.1e}", note, "good" if check["passed"] else "bad"))
     if "psf_arcmin" in record.get("image", {}):
@@ -196,9 +203,12 @@ def _rings(leakage: Mapping[str, Any]) -> list[Block]:
 def _checks(record: Mapping[str, Any]) -> list[Block]:
     rows: list[list[Any]] = []
     for name, check in record.get("checks", {}).items():
-        if name == "prediction":
+        if name == "prediction" and check.get("passed") is None:
+            found, wanted = check.get("text", ""), ""
+        elif name == "prediction":
             found, wanted = f"error {check['error']:.1e}", f"at most {check['bound']:.1e}"
-            name = f"prediction, {check['samples']} visibilities against the definition"
+            seen = ", ".join(f"{n} {of}/{all_}" for n, (of, all_) in check.get("seen", {}).items())
+            name = f"prediction, {check['samples']} visibilities against the definition" + (seen and f" ({seen})")
         else:
             found, wanted = "; ".join(dict.fromkeys(check.get("outcome", ()))), ""
         rows.append([name, found, wanted, _mark(check.get("passed", True))])
@@ -219,7 +229,7 @@ def _stages(record: Mapping[str, Any]) -> list[Block]:
     if not seconds:
         return []
     wrong = dict(record.get("stage_errors", {}))
-    if check := checks.get("prediction"):
+    if (check := checks.get("prediction")) and check.get("passed") is not None:
         wrong.setdefault("predict", f"{check['error']:.1e} measured, {check['bound']:.1e} at most, of the total flux")
     if check := checks.get("photometry"):
         wrong.setdefault("photometry", "; ".join(dict.fromkeys(check["outcome"])))

@@ -186,7 +186,8 @@ class PointSky(Sky):
     @property
     def power_jy(self) -> Float:
         """|I| + P at the reference frequencies, P = sqrt(Q^2 + U^2 + V^2), Jy (S,)."""
-        return np.asarray(np.abs(self.stokes_jy[:, 0]) + np.sqrt((self.stokes_jy[:, 1:] ** 2).sum(axis=1)))
+        q, u, v = self.stokes_jy[:, 1:].T
+        return np.asarray(np.abs(self.stokes_jy[:, 0]) + np.hypot(np.hypot(q, u), v))  # no square overflows
 
     def directions(self) -> tuple[Float, Float]:
         """ICRS right ascension and declination, rad (S,)."""

@@ -8,10 +8,10 @@ import numpy as np
 from pydantic import Field
 
 from instrument.jones.base import ElementBeam
-from instrument.mat2 import pack
+from instrument.mat2 import UNIT, pack
 from instrument.observe.directions import LIGHT
 from instrument.observe.sampling import Sampling
-from instrument.units import Complex, Metres, Radians
+from instrument.units import Complex, Float, Metres, Radians
 
 
 class CrossedDipole(ElementBeam):
@@ -28,6 +28,15 @@ class CrossedDipole(ElementBeam):
     def peak(self, at: Sampling) -> float:
         """1."""
         return 1.0
+
+    def rounding(self, at: Sampling) -> Float:
+        """That of the height in turns, of the angle from the zenith, and of the products."""
+        turns = 2 * np.pi * self.height * float(at.freq_hz.max()) / LIGHT
+        return np.array([UNIT * (22 * turns + 64)])
+
+    def jump(self, at: Sampling) -> float:
+        """0: it stands still."""
+        return 0.0
 
     def jones(self, at: Sampling) -> Complex:
         """J of the element, (T, F, A, S, 2, 2)."""

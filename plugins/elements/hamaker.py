@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from instrument.jones.base import ElementBeam
-from instrument.mat2 import pack
+from instrument.mat2 import UNIT, pack
 from instrument.observe.sampling import Sampling
 from instrument.units import Complex, Float
 
@@ -37,6 +37,25 @@ class Hamaker(ElementBeam):
         theta = np.linspace(0, np.pi / 2, 2001)[None, None, None]
         bound = sum(np.maximum(np.abs(t), np.abs(f)) for t, f in self._patterns(self._folded(at.freq_hz), theta))
         return 1.001 * float(np.max(bound))  # between the points of the grid it changes by less than 1e-3
+
+    def rounding(self, at: Sampling) -> Float:
+        """That of the polynomials, term by term (outside the band they cancel), and of the angles they are taken at."""
+        table, f0, df = coefficients(self.band)
+        x = float(np.abs(at.freq_hz - f0).max()) / df
+        theta = np.arccos(np.clip(at.rising.lowest, 0.0, 1.0))
+        size = np.abs(table).max(axis=3).sum(axis=0)  # (i, j)
+        out = np.zeros(len(theta))
+        for i in range(size.shape[0]):
+            for j in range(size.shape[1]):
+                # 16 roundings of theta; those of the azimuth act on what grows with theta, 4 turns of it
+                out += size[i, j] * x**j * ((2 * i + 3 * j + 50) * theta**i + 80 * i * theta ** max(i - 1, 0))
+        return UNIT * out
+
+    def jump(self, at: Sampling) -> float:
+        """What is no smooth field at the zenith: the second harmonic, 4 turns, and p_theta without p_phi, 2."""
+        first, second = self._folded(at.freq_hz)[:, 0]  # (F, d) each, at theta = 0
+        unlike = np.minimum(np.abs(first[:, 0] - first[:, 1]), np.abs(first[:, 0] + first[:, 1]))
+        return float((4 * np.abs(second).max(axis=1) + 2 * unlike).max())
 
     def jones(self, at: Sampling) -> Complex:
         """J of the element, (T, F, A, S, 2, 2)."""

@@ -1,0 +1,116 @@
+"""Bound on the rounding of float64 in a sum of sources: phases, Jones matrices, brightness, the sum itself.
+
+Every source has its own share, weighted with its flux: a direction 1 arcsec from a zenith loses 5 digits of its
+azimuth, the others lose none. Held to sums in extended precision by docs/reports/bounds.py.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from instrument.jones.base import ElementBeam
+from instrument.jones.chain import Chain
+from instrument.jones.parallactic import Parallactic
+from instrument.mat2 import UNIT
+from instrument.observe.directions import LIGHT
+from instrument.observe.sampling import Sampling
+from instrument.predict.base import Problem
+from instrument.sky.rounding import FLUX_CELLS, brightness_rounding, flux
+from instrument.units import Float
+
+SEEN = 16  # roundings of an apparent direction in the axes of a station: angles, M (s + v), unit length, axes
+PRODUCT = 12  # of a product of two 2x2 matrices
+
+
+def total_flux(problem: Problem) -> float:
+    """|I| + P of all sources in the brightest channel and at the brightest time, Jy."""
+    largest = 0.0
+    for part in _cells(problem):
+        largest = max(largest, float(flux(part.sky, part.at).sum(axis=-1).max()))
+    return largest
+
+
+def rounding(problem: Problem, scale_jy: float) -> float:
+    """Bound on the rounding of any visibility, relative to `scale_jy`."""
+    gain = known_gain(problem.chain, problem.at)
+    relative = gain * (_phase(problem) + UNIT * (2 * len(problem.at.ra_rad) + 40)) + _jones(problem)
+    largest = 0.0
+    for part in _cells(problem):
+        jansky = flux(part.sky, part.at)
+        wrong = (jansky * relative).sum(axis=-1) + gain * brightness_rounding(part.sky, part.at).sum(axis=-1)
+        largest = max(largest, float(wrong.max()))
+    return largest / scale_jy
+
+
+def known_gain(chain: Chain, at: Sampling) -> float:
+    """Bound on |J|^2; where no bound is known of a term, 1, and the plan says that it is assumed."""
+    peak = chain.peak(at)
+    return peak * peak if np.isfinite(peak) else 1.0  # infinity where no float holds it; ** 2 would raise
+
+
+def unknown_peaks(problem: Problem) -> list[str]:
+    """Terms whose size no bound is known of; the rounding takes 1."""
+    return [type(t).__name__ for t in problem.chain.parts if not np.isfinite(t.peak(problem.at))]
+
+
+def _cells(problem: Problem) -> list[Problem]:
+    """Pieces of times and channels that hold a brightness of moderate size."""
+    times, channels, _, sources = problem.at.shape
+    if problem.sky.sources() is not None:
+        times = 1  # the same at all
+    slots = max(1, int(FLUX_CELLS / sources))
+    nf = min(channels, slots)
+    nt = max(1, slots // nf)
+    return [
+        problem.block(slice(t, min(t + nt, times)), slice(f, f + nf))
+        for t in range(0, times, nt)
+        for f in range(0, channels, nf)
+    ]
+
+
+def _phase(problem: Problem) -> Float:
+    """Rounding of the fringe of each source on the longest baselines, and of the shape of a Gaussian, (S,)."""
+    at = problem.at
+    a, b = problem.antenna1, problem.antenna2
+    offsets = at.layout.positions_m - at.layout.centre_m
+    baseline = float(np.linalg.norm(offsets[a] - offsets[b], axis=1).max())
+    size = np.linalg.norm(offsets, axis=1)
+    per_m = float(at.freq_hz.max()) / LIGHT
+    reach = np.linalg.norm(at.lmn, axis=1)
+    # a baseline sees what its two stations have in common, the axes (16) and l, m (12, of 1 and not of themselves);
+    # the products of each station round by its distance from the centre of the array, which may be far outside
+    turns = baseline * (16 * reach + 12) + 8 * float((size[a] + size[b]).max()) * reach
+    out = 2 * np.pi * per_m * turns + 12
+    listed = problem.sky.sources()
+    if listed is not None and listed.gaussian.any():
+        # 4 pi^2 x exp(-2 pi^2 x^2) <= 3.9 for each axis; x is good to 30 roundings of |uv| sigma
+        out = out + 3.9 * 30 * per_m * baseline * np.linalg.norm(listed.shape_axes(at.centre), axis=-1).sum(axis=-1)
+    return np.asarray(UNIT * out)
+
+
+def _jones(problem: Problem) -> Float:
+    """Rounding of J_a B J_b^H for a source of unit brightness, (S,) or (1,)."""
+    at, parts = problem.at, problem.chain.parts
+    if not parts:
+        return np.zeros(1)
+    peaks = [t.peak(at) for t in parts]
+    peaks = [p if np.isfinite(p) else 1.0 for p in peaks]
+    whole = float(np.prod(peaks))
+    wrong = np.full(1, UNIT * PRODUCT * len(parts) * whole)
+    for k, term in enumerate(parts):
+        others = float(np.prod(peaks[:k] + peaks[k + 1 :]))
+        wrong = wrong + others * term.rounding(at)
+    # azimuths are good to a rounding over the distance from the zenith. An element that is one smooth field there turns
+    # back what Parallactic turns, so that what is left is its jump; at a horizon, above or below is chance
+    elements = [(k, t) for k, t in enumerate(parts) if isinstance(t, ElementBeam)]
+    turned = any(isinstance(t, Parallactic) for t in parts)
+    if elements or turned:
+        jump = 4 * whole if not turned else whole
+        if turned and elements:
+            k, element = elements[0]
+            jump = element.jump(at) * float(np.prod(peaks[:k] + peaks[k + 1 :]))
+        wrong = wrong + jump * np.minimum(UNIT * SEEN / np.maximum(at.rising.zenith, UNIT), np.pi)
+    if problem.chain.blind_below_horizon:
+        wrong = wrong + np.where(at.rising.horizon < UNIT * SEEN, whole, 0.0)
+    with np.errstate(over="ignore"):  # then nothing is known
+        return np.asarray(2 * whole * wrong + wrong**2)

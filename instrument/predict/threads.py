@@ -1,0 +1,49 @@
+"""BLAS on one thread inside the workers of a plan, and only there: the workers themselves are the threads."""
+
+from __future__ import annotations
+
+from functools import cache
+from threading import Lock
+from typing import Any
+
+from instrument.predict.base import Predictor, Problem
+from instrument.visibilities import Visibilities
+
+
+class OneThread:
+    """A limit that holds while any worker is inside; the last one to leave puts back what was there before.
+
+    BLAS counts its threads per process, so a limit for the whole of a run would also bind whoever takes its blocks.
+    """
+
+    def __init__(self) -> None:
+        self.lock, self.inside, self.limit = Lock(), 0, None
+
+    def __enter__(self) -> None:
+        with self.lock:
+            if self.inside == 0:
+                self.limit = _controller().limit(limits=1)
+            self.inside += 1
+
+    def __exit__(self, *_: Any) -> None:
+        with self.lock:
+            self.inside -= 1
+            if self.inside == 0 and self.limit is not None:
+                self.limit.restore_original_limits()
+                self.limit = None
+
+
+@cache
+def _controller() -> Any:
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()  # looks through all loaded libraries, once
+
+
+ONE_THREAD = OneThread()
+
+
+def predict(engine: Predictor, problem: Problem) -> Visibilities:
+    """A block, in a worker of any kind."""
+    with ONE_THREAD:
+        return engine.predict(problem)
