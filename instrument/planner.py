@@ -111,8 +111,8 @@ class Budget:
 def _scale(full: Problem) -> float:
     """Total flux, to which all errors are relative; refused where float64 cannot hold products with it."""
     scale_jy = total_flux(full)
-    if scale_jy and not 1e-250 < scale_jy < 1e250:
-        raise InputError(f"the sky has {scale_jy:.3g} Jy in all: give fluxes between 1e-250 and 1e250 Jy")
+    if scale_jy and not 1e-305 < scale_jy < 1e305:
+        raise InputError(f"the sky has {scale_jy:.3g} Jy in all: give fluxes between 1e-305 and 1e305 Jy")
     return scale_jy
 
 

@@ -276,9 +276,9 @@ def test_f4_a_bright_source_of_1e155_jy_is_not_faint():
     assert sky.brightest(1).names == ("s1",)
 
 
-@pytest.mark.parametrize("size", [1e-300, 1e300])
+@pytest.mark.parametrize("size", [1e-310, 1e307])
 def test_f4_fluxes_whose_products_no_float_holds_are_refused(size):
-    with pytest.raises(InputError, match="give fluxes between 1e-250 and 1e250 Jy"):
+    with pytest.raises(InputError, match="give fluxes between 1e-305 and 1e305 Jy"):
         scene(PointSky.at(near([[0, 0]]), [[size, 0, 0, 0]])).plan()
 
 
