@@ -13,7 +13,7 @@ from instrument.errors import BeamStateError, InputError
 from instrument.jones import mueller
 from instrument.jones.base import JonesTerm
 from instrument.jones.chain import Chain
-from instrument.jones.gain import slot_normals
+from instrument.jones.gain import exact_key, slot_normals
 from instrument.jones.towards import Towards
 from instrument.model import Instrument
 from instrument.observe.layout import Layout
@@ -149,7 +149,7 @@ class Visibilities:
         count = len(self.antenna1)
         for i, freq in enumerate(self.freq_hz):
             # slot_normals has unit power over both parts, so each part has 1/2
-            noisy[:, i] += np.sqrt(2) * sigma * slot_normals((seed, round(freq)), self.at.slots_s, (count, 2, 2))
+            noisy[:, i] += np.sqrt(2) * sigma * slot_normals((seed, exact_key(freq)), self.at.slots_s, (count, 2, 2))
         return replace(self, data=noisy)
 
     def corrected(self, term: JonesTerm | Chain) -> Visibilities:

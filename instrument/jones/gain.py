@@ -103,7 +103,11 @@ def slot_normals(key: tuple[int, ...], slots_s: Float, shape: tuple[int, ...]) -
     """Complex normal numbers of unit power for each time slot, (T, *shape); a draw depends on key and time only."""
     out = np.empty((len(slots_s), *shape), complex)
     for row, slot in zip(out, slots_s, strict=True):
-        # times before 1858 have negative seconds, which are counted from the other end
-        rng = np.random.default_rng([*key, round(slot * 1000) % 2**63])
+        rng = np.random.default_rng([*key, exact_key(slot)])
         row[...] = rng.standard_normal((*shape, 2)).view(complex)[..., 0]
     return out * np.sqrt(0.5)
+
+
+def exact_key(value: float) -> int:
+    """A whole number that no other time or frequency has: its bits. Rounded to 1 ms, 88 of 200 slots of 1 ms meet."""
+    return int((np.float64(value) + 0.0).view(np.uint64))  # + 0.0: -0.0 is 0.0

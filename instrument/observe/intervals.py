@@ -59,4 +59,8 @@ def intervals(
     length = step * integration_s
     # integrations of a regular grid lie half an integration from any edge: rounding cannot move one across
     number, group = np.unique(np.floor((slots_s - begin) / length).astype(int), return_inverse=True)
-    return Intervals(group.reshape(-1), begin + (number + 0.5) * length, float(length), step)
+    centres = begin + (number + 0.5) * length
+    # a centre that is a slot has its bits, which are the key of drawn gains
+    near = slots_s[np.clip(np.searchsorted(slots_s, centres - 1e-3 * integration_s), 0, len(slots_s) - 1)]
+    centres = np.where(np.abs(near - centres) < 1e-3 * integration_s, near, centres)
+    return Intervals(group.reshape(-1), centres, float(length), step)
