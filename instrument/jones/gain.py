@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from instrument import mat2
 from instrument.errors import InputError
 from instrument.jones.base import Basis, JonesTerm, Simplified, Structure
+from instrument.jones.lookup import demand_within, nearest
 from instrument.observe.sampling import Sampling
 from instrument.units import ArrayOf, Complex, Float
 
@@ -22,9 +23,9 @@ class StationTable(JonesTerm):
     """Two complex numbers per station, (T, F, A, 2): `values`, plus errors of rms `rms` drawn anew for every time.
 
     `values` has axes of length 1 where constant; `slots_s` (MJD seconds, UTC) and `freq_hz` say where its times and
-    channels are when there is more than one, and the nearest is taken. The drawn part is complex Gaussian with
-    E|x|^2 = rms^2, independent between stations, receptors and integrations, equal for all channels, and depends only
-    on the seed and the time, never on how a run was cut into blocks.
+    channels are when there is more than one, and the nearest is taken (half a step outside at most). The drawn part is
+    complex Gaussian with E|x|^2 = rms^2, independent between stations, receptors and integrations, equal for all
+    channels, and depends only on the seed and the time, never on how a run was cut into blocks.
     """
 
     maps: ClassVar[tuple[Basis, Basis]] = ("feed", "feed")
@@ -39,11 +40,17 @@ class StationTable(JonesTerm):
 
     @model_validator(mode="after")
     def _axes_fit(self) -> Self:
+        axes = ((0, "slots_s", self.slots_s), (1, "freq_hz", self.freq_hz))
+        for _, name, known in axes:
+            if known is not None and not (np.all(np.isfinite(known)) and np.all(np.diff(np.sort(known)))):
+                raise InputError(f"{name} must be finite, and no entry twice")
+            if known is not None and self.values is None:
+                raise InputError(f"{name} says where entries of `values` are: give values")
         if self.values is None:
             return self
         if not np.all(np.isfinite(self.values)):
             raise InputError("values must be finite: leave out a station rather than giving it NaN")
-        for axis, name, coordinate in ((0, "slots_s", self.slots_s), (1, "freq_hz", self.freq_hz)):
+        for axis, name, coordinate in axes:
             count = self.values.shape[axis]
             if count > 1 and (coordinate is None or len(coordinate) != count):
                 raise InputError(f"values has {count} entries along axis {axis}: {name} must name as many")
@@ -57,8 +64,8 @@ class StationTable(JonesTerm):
                 raise InputError(
                     f"{type(self).__name__} holds {self.values.shape[2]} stations, the array has {len(at.layout)}"
                 )
-            rows = _nearest(self.slots_s, at.slots_s, self.values.shape[0], "time", "s")
-            cols = _nearest(self.freq_hz, at.freq_hz, self.values.shape[1], "frequency", "Hz")
+            rows = _entries(self.slots_s, at.slots_s, self.values.shape[0], "time")
+            cols = _entries(self.freq_hz, at.freq_hz, self.values.shape[1], "frequency")
             out = self.values[rows][:, cols]
         if self.rms:
             salt = zlib.crc32(type(self).__name__.encode())
@@ -85,18 +92,13 @@ class GainTerm(StationTable):
         return mat2.pack(g[..., 0], zero, zero, g[..., 1])
 
 
-def _nearest(known: Float | None, asked: Float, count: int, what: str, unit: str) -> Any:
-    if count == 1 or known is None:
+def _entries(known: Float | None, asked: Float, count: int, what: str) -> Any:
+    """The entry of a table that each time or channel takes; half an entry's width outside it at most."""
+    if known is None or len(known) != count:
         return slice(None)
     order = np.argsort(known)
-    ranked = known[order]
-    right = np.clip(np.searchsorted(ranked, asked), 1, count - 1)
-    pick = np.where(asked - ranked[right - 1] < ranked[right] - asked, right - 1, right)
-    gap = np.abs(ranked[pick] - asked)
-    step = np.diff(ranked).max()
-    if gap.max() > 0.5001 * step:
-        raise InputError(f"a table is asked at a {what} {gap.max():.6g} {unit} away from its nearest entry")
-    return order[pick]
+    demand_within(known[order], asked, what, reach=0.5)
+    return slice(None) if count == 1 else order[nearest(known[order], asked)]
 
 
 def slot_normals(key: tuple[int, ...], slots_s: Float, shape: tuple[int, ...]) -> Complex:

@@ -9,6 +9,7 @@ from pydantic import model_validator
 
 from instrument.errors import InputError
 from instrument.jones.base import Basis, JonesTerm
+from instrument.jones.lookup import between, demand_within, nearest
 from instrument.observe.sampling import Sampling
 from instrument.units import ArrayOf, Complex, Float
 
@@ -20,9 +21,11 @@ class JonesTable(JonesTerm):
     """Jones matrices of each station, complex (T, F, A, 1, 2, 2), from `values` (t, f, A, 2, 2) on their own grid.
 
     `slots_s` (MJD seconds, UTC) and `freq_hz` are the centres of the intervals of `values`. Times between them take the
-    nearest interval or, with `interpolation` "linear", the straight line between two (element by element: for
-    solutions whose gauge drifts, align them first). NaN marks an interval or a station without a solution: what is
-    corrected with it is flagged. Times farther than one interval outside the table raise `InputError`.
+    nearest interval or, with `interpolation` "linear", what lies between two in amplitude and phase (full matrices in
+    their Hermitian and unitary parts; for solutions whose gauge drifts, align them first). NaN marks an interval or a
+    station without a solution: what is corrected with it is flagged. Times and channels farther than one entry outside
+    the table raise `InputError`, and so does a single entry asked more than a day or a factor of 2 in frequency away;
+    a single entry at 0 has no place and is constant.
     """
 
     maps: ClassVar[tuple[Basis, Basis]] = ("feed", "feed")
@@ -56,21 +59,19 @@ class JonesTable(JonesTerm):
             raise InputError(f"JonesTable holds {self.values.shape[2]} stations, the array has {len(at.layout)}")
         if self.stations and tuple(at.layout.names) != self.stations:
             raise InputError("JonesTable is of other stations than the array, or in another order")
-        found = self._along(self.values, 0, self.slots_s, at.slots_s, "time", "s")
-        return self._along(found, 1, self.freq_hz, at.freq_hz, "frequency", "Hz")[:, :, :, None]
+        found = self._along(self.values, 0, self.slots_s, at.slots_s, "time")
+        return self._along(found, 1, self.freq_hz, at.freq_hz, "frequency")[:, :, :, None]
 
-    def _along(self, values: Complex, axis: int, known: Float, asked: Float, what: str, unit: str) -> Complex:
+    def _along(self, values: Complex, axis: int, known: Float, asked: Float, what: str) -> Complex:
+        demand_within(known, asked, what, reach=1.0)
         if len(known) == 1:
             return values
-        step = np.diff(known)
-        outside = np.maximum(known[0] - asked, asked - known[-1]).max()
-        if outside > step.max():
-            raise InputError(f"a table is asked at a {what} {outside:.6g} {unit} outside it")
-        right = np.clip(np.searchsorted(known, asked), 1, len(known) - 1)
-        share = np.clip((asked - known[right - 1]) / step[right - 1], 0.0, 1.0)
         if self.interpolation == "nearest":
-            return np.take(values, np.where(share < 0.5, right - 1, right), axis=axis)
-        share = share.reshape([-1 if k == axis else 1 for k in range(values.ndim)])
+            return np.take(values, nearest(known, asked), axis=axis)
+        right = np.clip(np.searchsorted(known, asked), 1, len(known) - 1)
+        share = np.clip((asked - known[right - 1]) / np.diff(known)[right - 1], 0.0, 1.0)
+        share = share[:, None, None] if axis == 0 else share[:, None]
         left, after = np.take(values, right - 1, axis=axis), np.take(values, right, axis=axis)
+        ends = share[..., None, None]
         # where one end is meant alone, the other may be NaN
-        return np.where(share == 0, left, np.where(share == 1, after, (1 - share) * left + share * after))
+        return np.where(ends == 0, left, np.where(ends == 1, after, between(left, after, share)))
