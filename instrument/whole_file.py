@@ -3,22 +3,36 @@
 from __future__ import annotations
 
 import os
+import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from instrument.errors import FileError
+
 
 @contextmanager
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Gives a path to write to; it becomes `path` when what is inside succeeds, and is removed when it does not."""
+    """Gives a path to write to; it becomes `path` when what is inside succeeds, and is removed when it does not.
+
+    The path lies in a new folder of a random name that only its owner may enter: nobody can have put a link to
+    another file in its place. A link at `path` itself is replaced, not followed. What the system says against writing
+    (full disk, no permission, no such folder) is a `FileError`.
+    """
     target = Path(path)
-    partial = target.with_name(target.name + ".part")
+    private: Path | None = None
     try:
-        yield partial
-        partial.replace(target)
+        private = Path(tempfile.mkdtemp(prefix=".partial-", dir=target.parent))
+        yield private / target.name
+        (private / target.name).replace(target)
+    except OSError as error:
+        why = error.strerror or str(error).partition("\n")[0] or type(error).__name__
+        raise FileError(f"{path} cannot be written: {why}") from None
     finally:
-        partial.unlink(missing_ok=True)
+        if private is not None:
+            shutil.rmtree(private, ignore_errors=True)
 
 
 def write_ecsv(table: Any, path: str | os.PathLike[str]) -> None:

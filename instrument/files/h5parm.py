@@ -3,19 +3,22 @@
 A solset (a group, "sol000") holds tables `antenna` and `source`, and soltabs (groups, "amplitude000" and "phase000")
 with `val`, `weight` (0: flagged) and an array for each axis; the attribute AXES of `val` gives their order. DP3 6.6.0
 writes time,freq,ant,pol (gaincal) or time,freq,ant,dir,pol (ddecal); pol is XX,XY,YX,YY (full Jones), XX,YY (diagonal),
-or left out (scalar). Any order is read.
+or left out (scalar). Any order is read. Along time or freq, where it is left out (a bandpass of prefactor or LINC is
+ant,freq,pol), solutions are constant, as DP3 takes them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from instrument.errors import FileError
+from instrument.files import h5
+from instrument.files.h5 import one_line as one_line
+from instrument.files_in import harmless
 from instrument.units import Float
 
 POLS: dict[str, tuple[str, ...]] = {
@@ -26,11 +29,20 @@ POLS: dict[str, tuple[str, ...]] = {
 }
 AXES = ("time", "freq", "ant", "dir", "pol")
 KINDS = ("amplitude", "phase")
+ALIKE = {f"{prefix}{kind}": kind for prefix in ("scalar", "commonscalar") for kind in KINDS}
+# tables from which gains follow: what they are a phase of, for the remedy of a refusal
+DERIVED = {
+    "clock": "a phase of 2 pi freq clock",
+    "tec": "a phase of -8.4479745e9 tec / freq",
+    "tec3rd": "a phase that falls as freq^-3",
+    "rotation": "a rotation of the feeds",
+    "rotationmeasure": "a rotation by RM (c / freq)^2",
+}
 
 
 @dataclass
 class Soltab:
-    """A table read: values (t, f, A, P), NaN where the weight is 0, and its axes."""
+    """A table read: values (t, f, A, P), NaN where the weight is 0, and the axes that it has."""
 
     name: str
     kind: str
@@ -42,114 +54,130 @@ def read_soltabs(
     path: Any, solset: str | None, soltabs: Sequence[str] | None, direction: str | None
 ) -> tuple[str, list[Soltab]]:
     """File and solset in words, and the tables: an amplitude, a phase, or both; raises `FileError`."""
+    with h5.opened(path, "h5parm") as store:
+        chosen = _solset(store, solset)
+        tables = [_soltab(group, direction) for group in _soltabs(chosen, soltabs)]
+        return f"{h5.file_of(chosen)}, {chosen.name}", tables
+
+
+def _groups(group: Any) -> dict[str, Any]:
     import h5py
 
-    file = Path(path)
-    try:
-        with h5py.File(file, "r") as store:
-            chosen = _solset(file, store, solset)
-            tables = [_soltab(file, chosen[name], direction) for name in _soltabs(file, chosen, soltabs)]
-            return f"{file.name}, {chosen.name}", tables
-    except FileError:
-        raise
-    except FileNotFoundError:
-        raise FileError(f"{path} does not exist") from None
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:  # what h5py makes of broken content
-        raise FileError(f"{file.name} is not a readable h5parm: {one_line(error)}") from None
+    return {name: item for name, item in h5.members(group).items() if isinstance(item, h5py.Group)}
 
 
-def _solset(file: Path, store: Any, name: str | None) -> Any:
-    import h5py
+def _listing(names: Sequence[str]) -> str:
+    return harmless(", ".join(names), 200) or "none"
 
-    known = [key for key in store if isinstance(store[key], h5py.Group)]
+
+def _solset(store: Any, name: str | None) -> Any:
+    known = _groups(store)
     if name is None and len(known) == 1:
-        return store[known[0]]
+        return next(iter(known.values()))
     if name in known:
-        return store[name]
+        return known[name]
     if not known:
-        raise FileError(f"{file.name}: there is no solset in it (a group such as 'sol000')")
+        raise FileError(f"{h5.file_of(store)}: there is no solset in it (a group such as 'sol000')")
     what = "more than one solset; choose with solset=" if name is None else f"no solset '{name}'"
-    raise FileError(f"{file.name}: {what} ({', '.join(known)})")
+    raise FileError(f"{h5.file_of(store)}: {what} ({_listing(list(known))})")
 
 
-def _soltabs(file: Path, solset: Any, names: Sequence[str] | None) -> list[str]:
-    """Names of one amplitude table, or one phase table, or one of each."""
-    import h5py
-
-    known = {key: _kind(item) for key, item in solset.items() if isinstance(item, h5py.Group)}
-    listing = ", ".join(known) or "none"
+def _soltabs(solset: Any, names: Sequence[str] | None) -> list[Any]:
+    """One amplitude table, or one phase table, or one of each."""
+    groups = _groups(solset)
+    kinds = {name: _kind(group) for name, group in groups.items()}
+    plain = [name if kind in KINDS or name.startswith(kind) else f"{name} ({kind})" for name, kind in kinds.items()]
+    where = f"{h5.file_of(solset)}, {solset.name}"
     for name in names or ():
-        if name not in known:
-            raise FileError(f"{file.name}, {solset.name}: no soltab '{name}' (there are: {listing})")
-    chosen = list(known if names is None else names)
-    kinds = [known[name] for name in chosen]
-    if not kinds or len(set(kinds)) < len(kinds) or not set(kinds) <= set(KINDS):
+        if name not in groups:
+            raise FileError(f"{where}: no soltab '{name}' (there are: {_listing(plain)})")
+    chosen = list(groups if names is None else names)
+    found = [kinds[name] for name in chosen]
+    if not found or len(set(found)) < len(found) or not set(found) <= set(KINDS):
+        derived = [f"; {kind} is {DERIVED[kind]}: make a phase soltab of it" for kind in found if kind in DERIVED]
         raise FileError(
-            f"{file.name}, {solset.name}: needs one soltab of amplitudes, one of phases, or both, but has {listing}; "
-            "choose with soltabs=(...)"
+            f"{where}: needs one soltab of amplitudes, one of phases, or both, but has {_listing(plain)}; "
+            f"choose with soltabs=(...){derived[0] if derived else ''}"
         )
-    return chosen
+    return [groups[name] for name in chosen]
 
 
 def _kind(soltab: Any) -> str:
     """What a table holds: its TITLE, or else its name without the number."""
-    return _text(soltab.attrs.get("TITLE", "")) or soltab.name.rpartition("/")[2].rstrip("0123456789")
+    kind = h5.text(soltab.attrs.get("TITLE", "")) or soltab.name.rpartition("/")[2].rstrip("0123456789")
+    return ALIKE.get(kind, kind)
 
 
-def _soltab(file: Path, group: Any, direction: str | None) -> Soltab:
+def _soltab(group: Any, direction: str | None) -> Soltab:
     def fail(message: str) -> FileError:
-        return FileError(f"{file.name}, {group.name}: {message}")
+        return FileError(f"{h5.file_of(group)}, {group.name}: {message}")
 
-    for name in ("val", "weight"):
-        if name not in group:
-            raise fail(f"there is no '{name}'")
-        if "AXES" not in group[name].attrs:
+    val, weight = (h5.dataset(group, name) for name in ("val", "weight"))
+    for name, found in (("val", val), ("weight", weight)):
+        if "AXES" not in found.attrs:
             raise fail(f"'{name}' has no attribute AXES")
-    val, weight = group["val"], group["weight"]
-    axes = _text(val.attrs["AXES"]).split(",")
-    if len(set(axes)) < len(axes) or not set(AXES[:3]) <= set(axes) <= set(AXES):
-        raise fail(f"axes {','.join(axes)} of 'val'; time, freq and ant must be there, dir and pol may")
+    axes = h5.text(val.attrs["AXES"]).split(",")
+    if len(set(axes)) < len(axes) or "ant" not in axes or not set(axes) <= set(AXES):
+        raise fail(
+            f"axes {harmless(','.join(axes), 80)} of 'val'; time, freq and ant must be there by these names, dir and "
+            "pol may; without time or freq the solutions are constant along it"
+        )
     lacking = [axis for axis in axes if axis not in group]
     if lacking:
         raise fail(f"there is no array '{lacking[0]}', an axis of 'val'")
-    along = {axis: group[axis][()] for axis in axes}
-    along |= {axis: [_text(x) for x in along[axis]] for axis in AXES[2:] if axis in along}
-    wanted = tuple(len(along[axis]) for axis in axes)
+    # shapes are compared before anything is read: an axis may declare 1e9 entries in a file of 20 kB
+    sets = {axis: h5.dataset(group, axis) for axis in axes}
+    wanted = tuple(int(sets[axis].size) for axis in axes)
     if val.shape != wanted:
         raise fail(f"'val' has shape {val.shape}, its axes {','.join(axes)} need {wanted}")
-    if weight.shape != wanted or _text(weight.attrs["AXES"]).split(",") != axes:
-        raise fail(f"'weight' has shape {weight.shape} along {_text(weight.attrs['AXES'])}, unlike 'val'")
+    if weight.shape != wanted or h5.text(weight.attrs["AXES"]).split(",") != axes:
+        other = harmless(h5.text(weight.attrs["AXES"]), 80)
+        raise fail(f"'weight' has shape {weight.shape} along {other}, unlike 'val'")
+    h5.demand_affordable([val, weight, *sets.values()])
+    along: dict[str, Any] = {axis: h5.numbers(sets[axis]) for axis in AXES[:2] if axis in axes}
+    along |= {axis: h5.names(sets[axis]) for axis in AXES[2:] if axis in axes}
     twice = sorted({name for name in along["ant"] if along["ant"].count(name) > 1})
     if twice:
-        raise fail(f"station '{twice[0]}' is there twice")
+        raise fail(f"station '{harmless(twice[0], 80)}' is there twice")
+    along["pol"], order = _pols(along.get("pol"), fail)
 
-    values = np.where(np.asarray(weight[()], float) > 0, np.asarray(val[()], float), np.nan)
-    values = np.where(np.isfinite(values), values, np.nan)
-    for axis in AXES[3:]:
-        if axis not in axes:
-            values = values[..., None]
-    order = [*axes, *(axis for axis in AXES[3:] if axis not in axes)]
-    values = values.transpose([order.index(axis) for axis in AXES])
+    index: list[Any] = [slice(None)] * len(axes)
+    chosen = _chosen(along, direction, fail)
+    if "dir" in axes:
+        index[axes.index("dir")] = chosen
+    values, weights = (h5.numbers(found, tuple(index)) for found in (val, weight))
+    axes = [axis for axis in axes if axis != "dir"]
+    values, weights = (_ordered(array, axes)[..., order] for array in (values, weights))
+    if np.any(weights < 0):
+        raise fail("a weight is negative")
+    values = np.where((weights > 0) & np.isfinite(values), values, np.nan)
+    kind = _kind(group)
+    if kind == "amplitude" and np.any(values < 0):
+        raise fail(f"an amplitude is {np.nanmin(values):.6g}: negative ones belong into a phase of 180 deg")
+    return Soltab(group.name, kind, values, along)
 
+
+def _chosen(along: dict[str, Any], direction: str | None, fail: Any) -> int:
     directions = along.get("dir", [])
     found = [k for k, name in enumerate(directions) if direction in (None, name, name.strip("[]"))]
     if (direction is not None or "dir" in along) and len(found) != 1:
         asked = "choose one with direction=" if direction is None else f"'{direction}' is not one of them"
-        raise fail(f"solutions of {len(directions)} directions ({', '.join(directions)}); {asked}")
-    values = values[:, :, :, found[0] if found else 0]
+        raise fail(f"solutions of {len(directions)} directions ({harmless(', '.join(directions), 200)}); {asked}")
+    return found[0] if found else 0
 
-    pols = along.get("pol", [])
+
+def _pols(pols: list[str] | None, fail: Any) -> tuple[list[str], list[int]]:
+    """The polarizations in our order, and where each of them is in the file; one where there is no such axis."""
     for known in POLS.values():
-        if sorted(pols) == sorted(known) and bool(known) == ("pol" in along):
-            return Soltab(group.name, _kind(group), values[..., [pols.index(p) for p in known] or [0]], along)
-    raise fail(f"axis 'pol' holds {', '.join(pols) or 'nothing'}, which is neither XX, XY, YX, YY nor XX, YY")
+        if sorted(pols or []) == sorted(known) and bool(known) == (pols is not None):
+            return list(known), [(pols or []).index(p) for p in known] or [0]
+    there = harmless(", ".join(pols or []), 80) or "nothing"
+    raise fail(f"axis 'pol' holds {there}, which is neither XX, XY, YX, YY nor XX, YY")
 
 
-def _text(value: Any) -> str:
-    value = np.asarray(value).ravel()[0] if np.size(value) else ""
-    return value.decode() if isinstance(value, bytes) else str(value)
-
-
-def one_line(error: Exception) -> str:
-    """First line of what an error says."""
-    return (str(error) or type(error).__name__).splitlines()[0]
+def _ordered(array: Float, axes: list[str]) -> Float:
+    """Values with axes time, freq, ant, pol, of length 1 where the file has none."""
+    order = [axis for axis in AXES if axis != "dir"]
+    full = [*axes, *(axis for axis in order if axis not in axes)]
+    array = array.reshape(*array.shape, *[1] * (len(full) - len(axes)))
+    return np.asarray(array.transpose([full.index(axis) for axis in order]))
