@@ -21,8 +21,8 @@ HEAVY = {"astropy", "scipy", "numba", "matplotlib", "ducc0", "h5py", "jinja2", "
 # In the order in which imports may run: a group may import the groups of the lines above it, and within itself. A name
 # stands for a module or for a whole package.
 LAYERS = (
-    ("errors", "data", "scenes", "whole_file"),
-    ("numbers", "run_folder", "compiled", "terminal"),
+    ("errors", "data", "scenes"),
+    ("numbers", "run_folder", "compiled", "terminal", "whole_file"),
     ("units",),
     ("files_in",),
     ("registry", "mat2", "phasor", "scene_text"),
