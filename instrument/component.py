@@ -65,7 +65,7 @@ class Component(BaseModel, ABC):
     @classmethod
     def _right_subclass(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
         if isinstance(data, str) and cls.plugin_kind:
-            return _checked(load(cls.plugin_kind, data), cls)
+            return _checked(_by_name(cls.plugin_kind, data), cls)
         if isinstance(data, Mapping) and (KIND in data or ":" in str(data.get(OLD_TAG))):
             found = class_of(data, cls)
             fields = {k: v for k, v in data.items() if k not in (KIND, OLD_TAG)}
@@ -179,6 +179,17 @@ def _no_number(annotation: Any, value: Any) -> Any:
             inner = get_args(option)[0]
             return next((w for v in value if (w := _no_number(inner, v)) is not None), None)
     return None
+
+
+def _by_name(kind: str, name: str) -> Any:
+    """A plugin as it is without settings; where it needs some, the error shows how they are given."""
+    try:
+        return load(kind, name)
+    except InputError as error:
+        needs = re.search(r"needs '(\w+)'", str(error))
+        if needs is None:
+            raise
+        raise InputError(f'{error}; write {{ kind = "{name}", {needs[1]} = ... }}') from None
 
 
 def _checked(found: Any, wanted: type[Any]) -> Any:

@@ -79,7 +79,7 @@ def package_version(name: str) -> str:
 
 
 def _memory_gb() -> float:
-    from instrument.planner import machine_memory
+    from instrument.memory import machine_memory
 
     return machine_memory() / 1e9
 

@@ -10,9 +10,10 @@ import numpy as np
 
 from instrument.errors import InputError, RefusedError, did_you_mean, warn
 from instrument.jones.chain import Chain
+from instrument.memory import afford, usable
 from instrument.model import Instrument, warn_outside_band
 from instrument.not_modelled import not_modelled
-from instrument.numbers import COUNT, TOLERANCE, UV_RANGE
+from instrument.numbers import COUNT, TOLERANCE, UV_RANGE, brief
 from instrument.observe.directions import LIGHT
 from instrument.observe.observation import Observation
 from instrument.observe.sampling import Sampling
@@ -47,6 +48,10 @@ def make_plan(
     sky = sky.about(observation.phase_centre)
     warn_outside_band(chain, observation.freq_hz)
     ra, dec = sky.directions()
+    channels = observation.freq_hz.size
+    afford(
+        300.0 * channels * len(ra), f"a sky of {len(ra)} directions in {channels} channels", "ask for fewer of either"
+    )
     at = Sampling.build(layout, observation.times(layout), observation.freq_hz, ra, dec, observation.phase_centre)
     _must_rise(at)
     a, b = layout.baselines
@@ -250,15 +255,12 @@ def _choose(problem: Problem, name: str | None, budget: Budget) -> tuple[Predict
 
 
 def _limit(memory: Any) -> float:
-    return 0.75 * machine_memory() if memory is None else float(to_si(memory, "byte", "memory"))
-
-
-def machine_memory() -> float:
-    """Memory of this machine in bytes; 8 GB where it cannot be asked."""
-    try:
-        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-    except (AttributeError, ValueError, OSError):
-        return 8e9
+    if memory is None:
+        return usable()
+    found = to_si(memory, "byte", "memory", above=0)
+    if np.ndim(found):
+        raise InputError(f"memory = {brief(memory)} must be one size, such as '8 GB'")
+    return float(found)
 
 
 def _blocks(engine: Predictor, problem: Problem, workers: int, limit: float) -> tuple[tuple[int, int], Work, float]:

@@ -16,17 +16,19 @@ from instrument.calibrate.directional import DirectionalCal
 from instrument.calibrate.selfcal import SelfCal
 from instrument.component import Component
 from instrument.cube_analysis import CubeAnalysis
-from instrument.errors import InputError, did_you_mean
+from instrument.errors import InputError, did_you_mean, unused
 from instrument.image.dirty import Imager
 from instrument.jones.feed import FeedTerm
 from instrument.jones.gain import GainTerm
+from instrument.memory import afford
 from instrument.model import Instrument
+from instrument.numbers import Count, Seed, Tolerance, UvRange, Whole, brief
 from instrument.observe.observation import Observation
 from instrument.plan import Item, Plan
 from instrument.registry import available, load
 from instrument.scene import Scene
 from instrument.sky.base import Sky
-from instrument.units import Float, Hertz, HertzArray, Instant, Jansky, Seconds, SkyDirection
+from instrument.units import Float, Hertz, HertzArray, Instant, Jansky, PositiveHertz, Seconds, SkyDirection
 
 CALIBRATIONS = ("selfcal", "incomplete-model", "many-directions")
 STAGES = ("noise", "calibrate", "correct", "image", "analyze")
@@ -40,12 +42,15 @@ class Laboratory(Protocol):
         """The result."""
 
 
+MOST_CHANNELS = 1_000_000
+
+
 class Frequency(Component):
     """Channels: `centre` of the band, `width` of one channel (also their spacing), how many."""
 
-    centre: Hertz
-    width: Hertz
-    channels: int = Field(default=1, ge=1)
+    centre: PositiveHertz
+    width: PositiveHertz
+    channels: Annotated[int, Whole(at_least=1, at_most=MOST_CHANNELS)] = 1
 
     def values_hz(self) -> Float:
         """Channel centres, Hz (F,)."""
@@ -99,8 +104,8 @@ class AnalyzeTable(Component):
     """The table [analyze]: products, settings of forced photometry, and [analyze.cube]: what is made of the images."""
 
     products: tuple[Literal["leakage", "spectrum-2d"], ...] = ("leakage",)
-    uv_range: tuple[float, float] | None = None
-    every: int = Field(default=1, ge=1)
+    uv_range: UvRange | None = None
+    every: Count = 1
     cube: CubeAnalysis | None = None
 
     def photometry(self) -> ForcedPhotometry:
@@ -113,8 +118,8 @@ class SceneFile(Component):
 
     name: str
     title: str = ""
-    seed: int = Field(default=0, ge=0)
-    tolerance: float = Field(default=0.0, ge=0)
+    seed: Seed = 0
+    tolerance: Tolerance = 0.0
     engine: str | None = None
     instrument: dict[str, Any]
     observation: ObservationTable
@@ -127,9 +132,11 @@ class SceneFile(Component):
 
     @model_validator(mode="after")
     def _stages_fit(self) -> Self:
-        self._calibration()
-        if not self.name or any(c in self.name for c in "/\\\0") or self.name.startswith("."):
-            raise InputError(f"name = {self.name!r} cannot name a folder")
+        self.calibrator()  # wrong settings of a stage are refused before anything is planned
+        self.laboratory()
+        odd = not self.name.isprintable() or self.name != self.name.strip() or len(self.name.encode()) > 200
+        if not self.name or odd or any(c in self.name for c in "/\\") or self.name.startswith("."):
+            raise InputError(f"name = {brief(self.name)} cannot name a folder")
         if self.analyze and "spectrum-2d" in self.analyze.products and self.image is None:
             raise InputError("[analyze] products = ['spectrum-2d'] needs images: give a table [image]")
         if self.analyze and self.analyze.cube and self.image is None:
@@ -215,7 +222,17 @@ class SceneFile(Component):
         return min(r[0] for r in given), max(r[1] for r in given)
 
     def plan(self, scene: Scene, memory: Any = None, workers: int | None = None) -> Plan:
-        """The plan of its scene: baselines that no product needs and stages that are absent are left out."""
+        """The plan of its scene: baselines that no product needs and stages that are absent are left out.
+
+        What a table asks for and no stage takes is named in a warning.
+        """
+        for table, names, why in self._not_used(scene):
+            unused(table, names, why)
+        if self.image is not None:
+            channels, pixels = scene.observation.freq_hz.size, self.image.pixels
+            what = f"image.pixels = {pixels}: images of {channels} channels"
+            # 5 planes of sums, 4 of the cube, and 3 of one that is being gridded or transformed
+            afford(8.0 * 12 * channels * pixels**2, what, "lower image.pixels, or the number of channels")
         found = scene.plan(
             tolerance=self.tolerance,
             engine=self.engine,
@@ -226,6 +243,27 @@ class SceneFile(Component):
         absent = [stage for stage in STAGES if getattr(self, stage) is None]
         items = (Item(", ".join(absent), "absent from the scene"),) if absent else ()
         return replace(found, left_out=found.left_out + items)
+
+    def _not_used(self, scene: Scene) -> list[tuple[str, list[str], str]]:
+        """Tables and keys that nothing will take: where, which, and why."""
+        kind, _ = self._calibration()
+        found: list[tuple[str, list[str], str]] = []
+        if kind in ("incomplete-model", "many-directions"):
+            tables = ["correct", "analyze", *(["image"] if kind == "many-directions" else [])]
+            given = [f"[{table}]" for table in tables if getattr(self, table) is not None]
+            found.append(("scene", given, f"a laboratory, [calibrate] kind = '{kind}', makes its own figures"))
+        elif self.correct is not None and not scene.instrument.chain().beams().parts:
+            found.append(("scene", ["[correct]"], "the instrument has no beam to take out"))
+        if self.analyze is not None and "leakage" not in self.analyze.products:
+            given = [key for key in ("uv_range", "every") if key in self.analyze.model_fields_set]
+            found.append(("[analyze]", given, "they are of the product 'leakage'"))
+        if self.image is not None and self.image.weighting != "briggs" and "robust" in self.image.model_fields_set:
+            found.append(
+                ("[image]", ["robust"], f"it is of weighting = 'briggs', and this is '{self.image.weighting}'")
+            )
+        if self.observation.frequency is not None and self.observation.channel_width is not None:
+            found.append(("[observation]", ["channel_width"], "'frequency' has its width"))
+        return found
 
 
 class _in_table:

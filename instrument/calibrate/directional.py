@@ -18,7 +18,7 @@ from instrument.calibrate.gauge import gauge_of
 from instrument.errors import InputError, InstrumentError, Outcome, did_you_mean
 from instrument.jones.base import JonesTerm
 from instrument.jones.table import JonesTable
-from instrument.units import Complex, Float, Int, Metres, Seconds, to_si
+from instrument.units import Complex, Float, Int, Metres, PositiveSeconds, to_si
 from instrument.visibilities import Visibilities
 
 Models = Mapping[str, Visibilities]
@@ -102,7 +102,7 @@ class DirectionalCal(Calibrator):
     """
 
     pattern: Literal["full", "diagonal", "scalar", "phase"] = "full"
-    interval: Annotated[Seconds | None, Field()] = None
+    interval: PositiveSeconds | None = None
     intervals: Annotated[dict[str, str], BeforeValidator(_seconds_by_name)] = {}  # noqa: RUF012 - pydantic copies it
     channels: Annotated[int, Field(ge=1)] = 1
     robust: Annotated[float | None, Field(gt=0)] = None

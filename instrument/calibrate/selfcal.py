@@ -17,7 +17,7 @@ from instrument.calibrate.lanes import Lanes, levels
 from instrument.errors import InputError, Outcome
 from instrument.jones.base import JonesTerm
 from instrument.jones.table import JonesTable
-from instrument.units import Complex, Float, Int, Metres, Seconds
+from instrument.units import Complex, Float, Int, Metres, PositiveSeconds
 from instrument.visibilities import Visibilities
 
 UNKNOWNS = {"full": 8, "diagonal": 4, "scalar": 2, "phase": 2}  # real numbers per station
@@ -35,7 +35,7 @@ class SelfCal(Calibrator):
     """
 
     pattern: Literal["full", "diagonal", "scalar", "phase"] = "full"
-    interval: Annotated[Seconds | None, Field()] = None
+    interval: PositiveSeconds | None = None
     channels: Annotated[int, Field(ge=1)] = 1
     tolerance: Annotated[float, Field(gt=0, lt=0.1)] = 1e-10
     iterations: Annotated[int, Field(ge=1)] = 200

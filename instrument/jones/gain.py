@@ -12,6 +12,7 @@ from instrument import mat2
 from instrument.errors import InputError
 from instrument.jones.base import Basis, JonesTerm, Simplified, Structure
 from instrument.jones.lookup import demand_within, nearest
+from instrument.numbers import Real
 from instrument.observe.sampling import Sampling
 from instrument.units import ArrayOf, Complex, Float
 
@@ -35,7 +36,7 @@ class StationTable(JonesTerm):
     values: Table | None = None
     slots_s: Axis | None = None
     freq_hz: Axis | None = None
-    rms: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    rms: Annotated[float, Real(at_least=0, at_most=1e6)] = 0.0
     seed: Annotated[int, Field(ge=0)] = 0
 
     @model_validator(mode="after")

@@ -8,10 +8,13 @@ import numpy as np
 from pydantic import model_validator
 
 from instrument.component import Component
-from instrument.errors import InputError
+from instrument.errors import InputError, RefusedError
+from instrument.memory import afford
 from instrument.observe.directions import transit_time
 from instrument.observe.layout import Layout
 from instrument.units import Float, Hertz, HertzArray, Instant, Seconds, SkyDirection
+
+MOST_TIMES = 3_000_000  # integrations that are planned at once, at 20 us and 1 kB each
 
 
 class Observation(Component):
@@ -65,6 +68,13 @@ class Observation(Component):
 
     def times(self, layout: Layout) -> Any:
         """Centres of the integrations, UTC `Time` (T,); the layout says where "transit" is."""
+        asked = self.duration / self.interval
+        if asked > MOST_TIMES:
+            raise RefusedError(
+                f"duration = {self.duration:g} s by interval = {self.interval:g} s is {asked:.3g} integrations, and "
+                f"{MOST_TIMES} are planned at once: lengthen the interval, or split the observation"
+            )
+        afford(1e3 * self.count, f"an observation of {self.count} integrations", "lengthen the interval")
         from astropy import units as u
 
         if self.transit is not None:

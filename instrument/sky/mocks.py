@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from importlib.resources import files
-from typing import Annotated, Any, Self
+from typing import Any, Self
 
 import numpy as np
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import PrivateAttr, model_validator
 
-from instrument.errors import InputError
+from instrument.errors import InputError, warn
+from instrument.memory import afford
+from instrument.numbers import Count, Finite, NotNegative, Seed, Share
 from instrument.observe.directions import offset, tangents
 from instrument.observe.sampling import Sampling
 from instrument.sky.base import Sky
 from instrument.sky.points import PointSky
 from instrument.units import Complex, Direction, Float, Hertz, Jansky, Radians
-
-Count = Annotated[int, Field(ge=1)]
-Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
 class GeneratedSky(Sky):
@@ -26,12 +25,17 @@ class GeneratedSky(Sky):
     _placed: dict[Direction, PointSky] = PrivateAttr(default_factory=dict)
 
     @abstractmethod
+    def number(self) -> int:
+        """How many sources it has."""
+
+    @abstractmethod
     def place(self, centre: Direction) -> PointSky:
         """The sources about a phase centre."""
 
     def about(self, centre: Direction) -> PointSky:
         """The sources about a phase centre; the latest centre is remembered."""
         if centre not in self._placed:
+            afford(1e3 * self.number(), f"a sky of {self.number()} sources", "lower its count or shape")
             placed = self.place(centre)
             self._placed.clear()
             self._placed[centre] = placed
@@ -66,8 +70,8 @@ class GridSky(GeneratedSky):
     spacing: Radians = float(np.deg2rad(0.66))
     flux: Jansky = 0.4
     centre_flux: Jansky | None = None
-    spectral_index: float = Field(default=0.0, allow_inf_nan=False)
-    polarization: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    spectral_index: Finite = 0.0
+    polarization: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
     frequency: Hertz = 150e6
 
     @model_validator(mode="after")
@@ -76,9 +80,15 @@ class GridSky(GeneratedSky):
             raise InputError("spacing and frequency must be positive")
         if not np.sqrt(np.sum(np.square(self.polarization))) <= 1:
             raise InputError(f"polarization = {self.polarization} are fractions of I: together at most 1")
+        if min(self.flux, self.centre_flux or 0.0) < 0:
+            warn(f"flux = {self.flux:g} Jy, centre_flux = {self.centre_flux}: a negative flux is taken as it stands")
         if self.centre_flux is not None and not (self.shape[0] % 2 and self.shape[1] % 2):
             raise InputError(f"centre_flux needs odd numbers: a grid of {self.shape} has no source at its centre")
         return self
+
+    def number(self) -> int:
+        """East times north."""
+        return self.shape[0] * self.shape[1]
 
     def place(self, centre: Direction) -> PointSky:
         """The grid about a phase centre."""
@@ -104,13 +114,13 @@ class RandomSky(GeneratedSky):
     radius: Radians = float(np.deg2rad(5))
     flux_min: Jansky = 0.027
     flux_max: Jansky = 83.0
-    slope: float = Field(default=1.9, allow_inf_nan=False)
-    polarization: Fraction = 0.0
-    circular: Fraction = 0.0
-    spectral_index: float = Field(default=-0.75, allow_inf_nan=False)
-    scatter: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
+    slope: Finite = 1.9
+    polarization: Share = 0.0
+    circular: Share = 0.0
+    spectral_index: Finite = -0.75
+    scatter: NotNegative = 0.0
     frequency: Hertz = 150e6
-    seed: int = Field(default=0, ge=0)
+    seed: Seed = 0
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
@@ -125,6 +135,10 @@ class RandomSky(GeneratedSky):
         if self.frequency <= 0:
             raise InputError("frequency must be positive")
         return self
+
+    def number(self) -> int:
+        """`count`."""
+        return self.count
 
     def place(self, centre: Direction) -> PointSky:
         """The sources about a phase centre."""
@@ -150,10 +164,10 @@ class FaradaySky(GeneratedSky):
     count: Count = 200
     radius: Radians = float(np.deg2rad(2))
     flux: Jansky = 1.0
-    depths: tuple[float, float] = (-1.5, 5.0)
-    spectral_index: float = Field(default=0.0, allow_inf_nan=False)
+    depths: tuple[Finite, Finite] = (-1.5, 5.0)
+    spectral_index: Finite = 0.0
     frequency: Hertz = 150e6
-    seed: int = Field(default=0, ge=0)
+    seed: Seed = 0
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
@@ -164,6 +178,10 @@ class FaradaySky(GeneratedSky):
         if not (np.isfinite(self.depths).all() and self.depths[0] <= self.depths[1]):
             raise InputError(f"depths = {self.depths}: give the least and the most, in rad/m2")
         return self
+
+    def number(self) -> int:
+        """`count`."""
+        return self.count
 
     def place(self, centre: Direction) -> PointSky:
         """The points about a phase centre."""
@@ -187,11 +205,15 @@ class MockField(GeneratedSky):
     of the field itself, whatever the phase centre. Not a measurement, and twice denser than the sky.
     """
 
-    seed: int = Field(default=196, ge=0)
+    seed: Seed = 196
     components: bool = False
-    spectral_index: float = Field(default=-0.75, allow_inf_nan=False)
-    scatter: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
-    pairs: Fraction = 0.0
+    spectral_index: Finite = -0.75
+    scatter: NotNegative = 0.0
+    pairs: Share = 0.0
+
+    def number(self) -> int:
+        """Two bright ones, those drawn, and the rest of 3C196 where it is in components."""
+        return DRAWN + 2 + 3 * self.components
 
     def place(self, centre: Direction) -> PointSky:
         """The sources."""

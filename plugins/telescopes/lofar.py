@@ -16,9 +16,11 @@ from instrument.jones.chain import Chain
 from instrument.jones.parallactic import Parallactic
 from instrument.jones.station import ArrayFactor, Level, StationBeam
 from instrument.model import Instrument
+from instrument.numbers import brief
 from instrument.observe.layout import Layout
-from instrument.units import Float, Hertz, SkyDirection
+from instrument.units import Float, PositiveHertz, SkyDirection
 
+ALL = ("all",)  # stands for the stations of the paper; no list that is given can be it
 AXES = ("px", "py", "pz", "qx", "qy", "qz", "rx", "ry", "rz")
 
 
@@ -28,10 +30,10 @@ class _Lofar(Instrument):
     station_file: ClassVar[str]
     parts_file: ClassVar[str]
 
-    stations: tuple[str, ...] = Field(default=(), validate_default=True)
+    stations: tuple[str, ...] = Field(default=ALL, validate_default=True)
     beam_kind: Literal["full", "element", "array-factor"] | None = Field(default="full", alias="beam")
     beam_pointing: SkyDirection | None = None
-    reference_frequency: Hertz | None = None
+    reference_frequency: PositiveHertz | None = None
 
     @field_validator("beam_kind", mode="before")
     @classmethod
@@ -43,13 +45,17 @@ class _Lofar(Instrument):
     def _known(cls, value: Any) -> Any:
         rows = table(cls.station_file)
         names = list(map(str, rows["name"]))
-        if not isinstance(value, list | tuple):
-            raise InputError(f"stations = {value!r} is not a list of station names")
-        if not value:
+        if value is ALL:
             return tuple(n for n, used in zip(names, rows["used"], strict=True) if used)
+        if not isinstance(value, list | tuple) or not all(isinstance(name, str) for name in value):
+            raise InputError(f"stations = {brief(value)} is not a list of station names")
+        if not value:
+            raise InputError(
+                f"stations = [] names none: leave the key out for the {int(sum(rows['used']))} of the paper"
+            )
         for name in value:
             if name not in names:
-                raise InputError(f"no station '{name}': {did_you_mean(str(name), names)}")
+                raise InputError(f"no station {brief(name)} in {cls.__name__}: {did_you_mean(name, names)}")
         if len(value) < 2:
             raise InputError(f"an interferometer needs at least two stations, got {len(value)}: {', '.join(value)}")
         return tuple(value)

@@ -24,7 +24,7 @@ LAYERS = (
     ("errors", "data", "scenes"),
     ("numbers", "run_folder", "compiled", "terminal", "whole_file"),
     ("units",),
-    ("files_in",),
+    ("files_in", "memory"),
     ("registry", "mat2", "phasor", "scene_text"),
     ("component",),
     ("observe",),

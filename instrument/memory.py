@@ -1,0 +1,56 @@
+"""Memory: what this machine and process may still use, and the refusal of more before it is allocated."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from instrument.errors import RefusedError
+from instrument.units import si_prefix
+
+SHARE = 0.75  # of the memory that is there, which one run may take
+
+
+def machine_memory() -> float:
+    """Bytes of memory of this machine, or of the group of processes it is limited to; 8 GB where it cannot be asked."""
+    try:
+        found = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    except (AttributeError, ValueError, OSError):
+        found = 8e9
+    for name in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
+        try:
+            found = min(found, float(Path(name).read_text()))
+        except (OSError, ValueError):  # no such file, or the word "max"
+            continue
+    return found
+
+
+def usable() -> float:
+    """Bytes that a run may take: three quarters of the machine, or of the addresses left under `ulimit -v`."""
+    return SHARE * min(machine_memory(), _addresses_left())
+
+
+def _addresses_left() -> float:
+    try:
+        import resource
+
+        limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+        if limit == resource.RLIM_INFINITY:
+            return np.inf
+        taken = float(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    except (ImportError, OSError):
+        return np.inf
+    return max(0.0, limit - taken)
+
+
+def afford(size: float, what: str, remedy: str) -> None:
+    """Raise `RefusedError` when `size` bytes are more than may be taken: what needs them, and the way out.
+
+    Called with the size that was asked for, before anything of it is allocated.
+    """
+    most = usable()
+    if not size <= most:
+        need = si_prefix(float(size), "B")
+        raise RefusedError(f"{what} would take {need} of memory, and {si_prefix(most, 'B')} may be taken: {remedy}")
