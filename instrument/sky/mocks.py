@@ -25,17 +25,12 @@ class GeneratedSky(Sky):
     _placed: dict[Direction, PointSky] = PrivateAttr(default_factory=dict)
 
     @abstractmethod
-    def number(self) -> int:
-        """How many sources it has."""
-
-    @abstractmethod
     def place(self, centre: Direction) -> PointSky:
         """The sources about a phase centre."""
 
     def about(self, centre: Direction) -> PointSky:
         """The sources about a phase centre; the latest centre is remembered."""
         if centre not in self._placed:
-            afford(1e3 * self.number(), f"a sky of {self.number()} sources", "lower its count or shape")
             placed = self.place(centre)
             self._placed.clear()
             self._placed[centre] = placed
@@ -86,12 +81,9 @@ class GridSky(GeneratedSky):
             raise InputError(f"centre_flux needs odd numbers: a grid of {self.shape} has no source at its centre")
         return self
 
-    def number(self) -> int:
-        """East times north."""
-        return self.shape[0] * self.shape[1]
-
     def place(self, centre: Direction) -> PointSky:
         """The grid about a phase centre."""
+        _priced(self.shape[0] * self.shape[1], "shape")
         steps = [np.arange(n) - (n - 1) / 2 for n in self.shape]
         k, j = (a.ravel() for a in np.meshgrid(*steps))
         ra, dec = offset(centre, k * self.spacing, j * self.spacing)
@@ -136,12 +128,9 @@ class RandomSky(GeneratedSky):
             raise InputError("frequency must be positive")
         return self
 
-    def number(self) -> int:
-        """`count`."""
-        return self.count
-
     def place(self, centre: Direction) -> PointSky:
         """The sources about a phase centre."""
+        _priced(self.count, "count")
         rng = np.random.default_rng(self.seed)
         ra, dec = _cap(centre, self.radius, rng.random(self.count), rng.random(self.count))
         flux = _power_law(rng.random(self.count), self.flux_min, self.flux_max, self.slope)
@@ -179,12 +168,9 @@ class FaradaySky(GeneratedSky):
             raise InputError(f"depths = {self.depths}: give the least and the most, in rad/m2")
         return self
 
-    def number(self) -> int:
-        """`count`."""
-        return self.count
-
     def place(self, centre: Direction) -> PointSky:
         """The points about a phase centre."""
+        _priced(self.count, "count")
         rng = np.random.default_rng(self.seed)
         ra, dec = _cap(centre, self.radius, rng.random(self.count), rng.random(self.count))
         linear = self.flux * np.exp(2j * np.pi * rng.random(self.count))
@@ -210,10 +196,6 @@ class MockField(GeneratedSky):
     spectral_index: Finite = -0.75
     scatter: NotNegative = 0.0
     pairs: Share = 0.0
-
-    def number(self) -> int:
-        """Two bright ones, those drawn, and the rest of 3C196 where it is in components."""
-        return DRAWN + 2 + 3 * self.components
 
     def place(self, centre: Direction) -> PointSky:
         """The sources."""
@@ -249,6 +231,10 @@ FIELD = Direction(float(np.deg2rad(123.4)), float(np.deg2rad(48.2175)))
 RADIUS = float(np.deg2rad(5))
 MODEL_JY, SECOND_JY, TOTAL_JY, FAINTEST_JY = 83.1326, 7.7, 796.64, 0.027
 BREAK_JY, BRIGHT_SLOPE, DRAWN = 1.5, 2.5, 4565
+
+
+def _priced(count: int, key: str) -> None:
+    afford(1e3 * count, f"a sky of {count} sources", f"lower its {key}")
 
 
 def mock_fluxes(rng: Any) -> tuple[float, Float]:

@@ -57,7 +57,7 @@ CASES = {
     "observation.phase_centre='nowhere'": ("nowhere", "08h13m36.0s"),
     "observation.phase_centre='08h13m36.0s -88d13m03s'": ("never rises", "elevation"),
     "observation.frequency.channels=0": ("channels = 0",),
-    "observation.frequency.centre='-150 MHz'": ("frequencies", "positive"),
+    "observation.frequency.centre='-150 MHz'": ("centre", "above 0 Hz"),
     "instrument.telescope='lofar'": ("lofar", "lofar-hba"),
     "instrument.stations=['CS001HBA0','CS001HBA9']": ("CS001HBA9", "did you mean 'CS001HBA"),
     "instrument.stations=['CS001HBA0']": ("at least two stations", "CS001HBA0"),
