@@ -130,16 +130,24 @@ class Checker:
     def see(self, block: Visibilities, full: Problem | None = None) -> None:
         """Compare what a block holds of the chosen cells; `full` is what it should hold, the whole scene by default."""
         begin, full = time.perf_counter(), full or self.full
+        for t, f, i, j in self._within(block, full):
+            self._compare(full, t, f, block, i, j)
+        self.spent += time.perf_counter() - begin
+
+    def holds(self, block: Visibilities) -> bool:
+        """Whether any of the chosen cells is in a block."""
+        return bool(self._within(block, self.full))
+
+    def _within(self, block: Visibilities, full: Problem) -> list[tuple[int, int, int, int]]:
+        """Chosen cells of a block: time and channel in the scene, and in the block."""
         _same_scene(block, full)
         times = _indices(full.at.slots_s, block.at.slots_s, full.interval_s / 4, "time", "MJD s")
         apart = np.diff(np.sort(full.at.freq_hz)).min(initial=4e-3 * full.at.freq_hz.min())
         channels = _indices(full.at.freq_hz, block.freq_hz, apart / 4, "channel", "Hz")
         column = {int(f): j for j, f in enumerate(channels)}
-        for i, t in enumerate(times.tolist()):
-            for f in self.cells.get(t, ()):
-                if f in column:
-                    self._compare(full, t, f, block, i, column[f])
-        self.spent += time.perf_counter() - begin
+        return [
+            (t, f, i, column[f]) for i, t in enumerate(times.tolist()) for f in self.cells.get(t, ()) if f in column
+        ]
 
     def _compare(self, full: Problem, t: int, f: int, block: Visibilities, i: int, j: int) -> None:
         cell = full.block(slice(t, t + 1), slice(f, f + 1)).between(block.antenna1, block.antenna2)
@@ -149,7 +157,7 @@ class Checker:
         if not used.size:
             return
         pick = int(used[np.argmax(np.where(np.isnan(found[used]), np.inf, found[used]))])  # NaN is the worst of all
-        if not found[pick] <= self.worst:
+        if not (found[pick] <= self.worst or np.isnan(self.worst)):
             self.worst = float(found[pick])
             names = full.at.layout.names
             pair = f"{names[block.antenna1[pick]]}-{names[block.antenna2[pick]]}"

@@ -14,7 +14,7 @@ from instrument.check import BY_STATIONS, DEFINITION, SHARE, Check, Checker, not
 from instrument.errors import RefusedError
 from instrument.predict.base import Predictor, Problem, Work
 from instrument.predict.direct import Direct
-from instrument.predict.threads import predict
+from instrument.predict.threads import look_again, predict
 from instrument.units import si_prefix
 from instrument.visibilities import Visibilities
 
@@ -139,6 +139,7 @@ class Plan:
     def _stream(
         self, executor: Executor, ahead: int, progress: Callable[[float], None] | None
     ) -> Iterator[Visibilities]:
+        look_again()
         waiting: deque[Future[Visibilities]] = deque()
         todo = self.slices
         done = 0

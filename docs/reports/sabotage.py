@@ -1,0 +1,114 @@
+"""One station, baseline, time or channel with a flipped sign in what the engine produced: is it found?
+
+    python docs/reports/sabotage.py [--times 288] [--channels 64] [--cases 40] [--small]
+
+A scene of 59 stations is planned; its blocks stream by once for each case with the sign of one thing flipped, as a run
+sees them, and are checked as they pass. A thing that was among the times and channels looked at must be found, so the
+share that is found is to be the share that the check prints. Writes sabotage.md beside this file.
+"""
+
+import argparse
+import platform
+import time
+from dataclasses import replace
+from datetime import date
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from astropy import units as u
+
+import instrument
+from instrument import Observation, Scene
+
+HERE = Path(__file__).parent
+KINDS = ("station", "baseline", "time", "channel")
+
+
+def scene(times, channels, stations=()):
+    lofar = instrument.load("telescopes", "lofar-hba", **({"stations": stations} if stations else {}))
+    night = Observation(
+        phase_centre="08h13m36.0s +48d13m03s",
+        transit="2012-12-07",
+        duration=times * 100 * u.s,
+        interval=100 * u.s,
+        frequencies=(150 + 0.2 * np.arange(channels)) * u.MHz,
+        channel_width=0.2 * u.MHz,
+    )
+    sky = instrument.load("skies", "grid", shape=(2, 2), spacing=1 * u.deg, flux=1 * u.Jy)
+    return Scene(name="sabotage", instrument=lofar, sky=sky, observation=night)
+
+
+def flipped(block, kind, k, plan):
+    """A block with the sign of the k-th station, baseline, time or channel turned."""
+    data = block.data.copy()
+    if kind == "station":
+        data[:, :, (block.antenna1 == k) | (block.antenna2 == k)] *= -1
+    elif kind == "baseline":
+        data[:, :, k] *= -1
+    elif kind == "time":
+        data[block.at.slots_s == plan.problem.at.slots_s[k]] *= -1
+    else:
+        data[:, block.freq_hz == plan.problem.at.freq_hz[k]] *= -1
+    return block.with_data(data)
+
+
+def hunt(plan, cases, rng):
+    """Cases found of each kind, the check of whole data, and the seconds of prediction and of the check."""
+    begin = time.perf_counter()
+    blocks = list(plan.blocks())
+    predicted = time.perf_counter() - begin
+    times, channels, baselines = plan.problem.shape
+    sizes = dict(zip(KINDS, (len(plan.problem.at.layout), baselines, times, channels), strict=True))
+    found = dict.fromkeys(KINDS, 0)
+    for kind in KINDS:
+        for seed in range(cases):
+            checker = plan.watched(seed=seed).checker
+            k = int(rng.integers(sizes[kind]))
+            for block in blocks:
+                if checker.holds(block):
+                    checker.see(flipped(block, kind, k, plan))
+            found[kind] += not checker.result().passed
+    watched = plan.watched(seed=0)
+    begin = time.perf_counter()
+    for block in blocks:
+        watched.checker.see(block)
+    return found, watched.check, predicted, time.perf_counter() - begin
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--times", type=int, default=288)
+    parser.add_argument("--channels", type=int, default=64)
+    parser.add_argument("--cases", type=int, default=40)
+    given = parser.parse_args()
+    plan = scene(given.times, given.channels).plan(memory="12 GB")
+    few = replace(plan, problem=plan.problem.block(slice(0, 2), slice(None)))
+    for _ in few.blocks():
+        pass  # compiled
+    found, check, predicted, spent = hunt(plan, given.cases, np.random.default_rng(0))
+    share = {"station": 1.0, "baseline": 1.0}
+    share |= {"time": check.times.seen / check.times.of, "channel": check.channels.seen / check.channels.of}
+    rows = [f"| {kind} | {found[kind]} of {given.cases} | {share[kind] * given.cases:.1f} |" for kind in KINDS]
+    text = f"""# Flipped signs in what an engine produced
+
+{date.today()}, {platform.machine()}, Python {platform.python_version()}, numpy {version("numpy")},
+numba {version("numba")}, instrument {version("instrument")}.
+Made by `python docs/reports/sabotage.py --times {given.times} --channels {given.channels} --cases {given.cases}`.
+
+59 stations, {given.times} times, {given.channels} channels, 4 sources. One thing has its sign turned in the data
+as they stream by; every case has its own seed. Unspoilt data: {check}.
+
+| flipped | found | due by the share that is printed |
+|---|---|---|
+""" + "\n".join(rows)
+    text += f"""
+
+The check took {spent:.2f} s, the prediction {predicted:.1f} s: {100 * spent / predicted:.1f} %.
+"""
+    (HERE / "sabotage.md").write_text(text, encoding="utf-8")
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
