@@ -7,46 +7,21 @@ import re
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
 
-from instrument.errors import FileError, InputError, InstrumentWarning
-from instrument.files.fits_axes import Grid, Role, axes_of, frequencies_of, grid_of, number, stokes_of
-from instrument.files.h5parm import one_line
+from instrument.errors import FileError, InputError, InstrumentWarning, RefusedError
+from instrument.files.fits_axes import Role
+from instrument.files.fits_header import Given, Part, look
+from instrument.files.fits_open import opened
 from instrument.image.cube import Psf, StokesCube, Unit
-from instrument.units import Float, to_si
+from instrument.planner import machine_memory
+from instrument.units import Float, si_prefix, to_si
 
 NAMES = "IQUV"
-BROKEN = (OSError, ValueError, TypeError, KeyError, IndexError)  # what astropy makes of broken files
-# with spaces, dots and asterisks left out; of BUNIT in capitals only what cannot be read in two ways
-FLUX = re.compile(r"([mµuμ]?)jy(?:/|per)?(?:(beam|bm)|(pixel|pix))(?:-1|\^-1)?|(?:beam|bm)-1([mµuμ]?)jy")
-PREFIX = {"": 1.0, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6}
-KELVIN = {"K": 1.0, "mK": 1e-3, "uK": 1e-6, "µK": 1e-6, "μK": 1e-6}
-
-
-@dataclass
-class _Part:
-    """What the header of one file says; the data are read later."""
-
-    path: Path
-    hdu: int
-    axes: dict[Role, int]
-    grid: Grid
-    channels: int
-    freq_hz: Float | None
-    stokes: list[str]
-    unit: Unit
-    factor: float
-    turns_u: bool
-    beams: Float  # (3, F): BMAJ, BMIN, BPA in rad; NaN where not given
-    wide: bool
-
-    @property
-    def name(self) -> str:
-        return self.path.name
+MFS = re.compile(r"(.*)-MFS(-.*)")  # WSClean: the mean of all channels, beside NAME-0000, NAME-0001, ...
 
 
 def read_cube(
@@ -72,120 +47,45 @@ def read_cube(
     if unit is not None and unit not in get_args(Unit):
         raise InputError(f"unit = {unit!r} is not one of {', '.join(map(repr, get_args(Unit)))}")
     freq = None if frequencies is None else np.atleast_1d(to_si(frequencies, "Hz", "frequencies"))
-    parts: list[_Part] = []
-    for path in paths:
-        parts.append(_look(Path(path), names if stokes is not None else None, unit, freq is not None))
+    parts: list[Part] = []
+    for path in _channels_alone(paths):
+        left = names if stokes is not None else None
+        parts.append(look(Path(path), Given(left, unit, freq is not None, psf is not None)))
         names = names[len(parts[-1].stokes) :]
     if names:
         raise InputError(f"stokes = {stokes!r} names {len(names)} more than the files have planes: {', '.join(names)}")
+    _named_as_they_say(parts)
     _same(parts)
     places, freq = _places(parts, freq)
     return _filled(parts, places, freq, psf)
 
 
-def _look(path: Path, names: list[str] | None, unit: Unit | None, named: bool) -> _Part:
-    from astropy.io import fits
-    from astropy.utils.exceptions import AstropyWarning
-
-    try:
-        # of keywords that it mends; of a short file, whose data are refused later
-        with warnings.catch_warnings(action="ignore", category=AstropyWarning), fits.open(path) as hdus:
-            for k, hdu in enumerate(hdus):
-                if hdu.is_image and hdu.header.get("NAXIS", 0) >= 2:
-                    return _described(path, k, hdus, names, unit, named)
-    except (FileError, InputError):
-        raise
-    except FileNotFoundError:
-        raise FileError(f"{path} does not exist") from None
-    except (*BROKEN, fits.VerifyError) as error:
-        raise FileError(f"{path.name or path} is not a readable FITS file: {one_line(error)}") from None
-    raise FileError(f"{path.name}: there is no image of two axes or more in it")
-
-
-def _described(path: Path, k: int, hdus: Any, names: list[str] | None, unit: Unit | None, named: bool) -> _Part:
-    file, header = path.name, hdus[k].header
-    axes = axes_of(file, header, named)
-    if "freq" not in axes and not named:
-        raise FileError(f"{file}: no axis is FREQ: give frequencies=")
-    channels = int(header[f"NAXIS{axes['freq']}"]) if "freq" in axes else 1
-    planes = int(header[f"NAXIS{axes['stokes']}"]) if "stokes" in axes else 1
-    if names is None:
-        found = stokes_of(file, header, axes.get("stokes"))
-        if found is None:
-            raise FileError(f"{file}: no axis is STOKES: say what it is, such as stokes='I'")
-    elif len(names) < planes:
-        raise InputError(f"stokes names too few: {file} has {planes}, of which {len(names)} are left to name")
-    else:
-        found = names[:planes]
-    table = next((h for h in hdus if h.name == "BEAMS" and not h.is_image), None)
-    freq: Float | None = None
-    if not named:
-        if table is not None and "FREQ" in table.columns.names:
-            freq = np.array(table.data["FREQ"], float)
+def _channels_alone(paths: Sequence[Any]) -> list[Any]:
+    """The files without the means over all channels that WSClean writes beside the channels."""
+    names = [Path(path).name for path in paths]
+    kept = []
+    for path, name in zip(paths, names, strict=True):
+        mean = MFS.fullmatch(name)
+        if mean and any(re.fullmatch(re.escape(mean[1]) + r"-\d+" + re.escape(mean[2]), other) for other in names):
+            _unused(name, "all of it", "the mean of all channels, no channel of its own")
         else:
-            freq = frequencies_of(file, header, axes["freq"])
-        if len(freq) != channels:
-            raise FileError(f"{file}: the table BEAMS has {len(freq)} rows, the axis FREQ {channels} channels")
-    convention = str(header.get("POLCCONV", "IAU")).strip().upper()
-    if convention not in ("IAU", "COSMO"):
-        raise FileError(f"{file}: POLCCONV = '{convention}' is neither IAU nor COSMO")
-    of_unit = (unit, 1.0) if unit else _unit(file, header)
-    beams = _beams(file, header, table, channels)
-    wide, turns = header["BITPIX"] == -64, convention == "COSMO"
-    return _Part(path, k, axes, grid_of(file, header, axes), channels, freq, found, *of_unit, turns, beams, wide)
+            kept.append(path)
+    return kept
 
 
-def _unit(file: str, header: Any) -> tuple[Unit, float]:
-    """Unit and factor of BUNIT: 'mJy/beam' is Jy/beam, 1e-3."""
-    text = str(header.get("BUNIT", "")).strip()
-    remedy = "give unit='Jy/beam', 'Jy/pixel' or 'K'"
-    if not text:
-        raise FileError(f"{file}: BUNIT is missing: {remedy}")
-    plain = re.sub(r"[\s.*()]", "", text)
-    if plain in KELVIN or plain.lower() == "kelvin":
-        return "K", KELVIN.get(plain, 1.0)
-    # MK, MJY/BEAM: mega or milli?
-    if (flux := FLUX.fullmatch(plain.lower())) and not plain.startswith("M"):
-        return "Jy/pixel" if flux[3] else "Jy/beam", PREFIX[flux[1] or flux[4] or ""]
-    raise FileError(f"{file}: BUNIT = '{text}' is not K, Jy/beam or Jy/pixel, or milli or micro of them: {remedy}")
+def _named_as_they_say(parts: list[Part]) -> None:
+    """Raises `InputError` where a header says Q, U or V and the caller another; I stands in many that nobody filled."""
+    for part in parts:
+        if not part.header_stokes or part.header_stokes == part.stokes:
+            continue
+        header, given = ",".join(part.header_stokes), ",".join(part.stokes)
+        if set(part.header_stokes) & set("QUV"):
+            remedy = "leave stokes= out, give the files in its order, or correct CRVAL of STOKES"
+            raise InputError(f"{part.name}: its axis STOKES says {header}, but stokes= says {given}: {remedy}")
+        part.notes.unused.append((f"STOKES = {header} of its header", f"stokes = '{given}' is given"))
 
 
-def _beams(file: str, header: Any, table: Any, channels: int) -> Float:
-    """BMAJ, BMIN, BPA of every channel in rad (3, F), NaN where not given."""
-    keys = ("BMAJ", "BMIN", "BPA")
-    if table is not None and {"BMAJ", "BMIN"} <= set(table.columns.names):
-        rows = table.data
-        if {"CHAN", "POL"} <= set(table.columns.names):  # CASA: one row a channel and Stokes parameter
-            rows = rows[rows["POL"] == rows["POL"].min()]
-            rows = rows[np.argsort(rows["CHAN"], kind="stable")]
-        if len(rows) != channels:
-            raise FileError(f"{file}: the table BEAMS has {len(rows)} beams, the axis FREQ {channels} channels")
-        columns = table.columns
-        return np.stack(
-            [
-                to_si(np.asarray(rows[k], float) * _angle(file, columns[k].unit), "rad", k, nan=True)
-                if k in columns.names
-                else np.zeros(channels)
-                for k in keys
-            ]
-        )
-    if "BMAJ" not in header:
-        return np.full((3, channels), np.nan)
-    major = number(file, header, "BMAJ")
-    widths = major, number(file, header, "BMIN", major), number(file, header, "BPA", 0.0)
-    return np.repeat(np.deg2rad(widths)[:, None], channels, axis=1)
-
-
-def _angle(file: str, text: str | None) -> Any:
-    from astropy import units as u
-
-    unit = u.Unit(text or "deg", parse_strict="silent")
-    if not unit.is_equivalent(u.rad):
-        raise FileError(f"{file}: the table BEAMS has the unit '{text}': needed deg, arcsec or rad")
-    return unit
-
-
-def _same(parts: list[_Part]) -> None:
+def _same(parts: list[Part]) -> None:
     """Raises `FileError` where two files differ in grid or unit."""
     first = parts[0]
     for part in parts[1:]:
@@ -204,10 +104,10 @@ def _same(parts: list[_Part]) -> None:
             raise FileError(f"{both} are in {part.unit} and {first.unit}: needed one unit, or unit= for all")
 
 
-Places = dict[str, list[tuple[_Part, int, int]]]  # of a Stokes parameter: part, its plane there, its first channel
+Places = dict[str, list[tuple[Part, int, int]]]  # of a Stokes parameter: part, its plane there, its first channel
 
 
-def _places(parts: list[_Part], given: Float | None) -> tuple[Places, Float]:
+def _places(parts: list[Part], given: Float | None) -> tuple[Places, Float]:
     """Where each plane of each file goes, and the frequencies (F,), the same for every Stokes parameter."""
     places: Places = {}
     count: dict[str, int] = {}
@@ -242,30 +142,29 @@ def _places(parts: list[_Part], given: Float | None) -> tuple[Places, Float]:
 
 
 @contextmanager
-def _data(part: _Part) -> Iterator[Any]:
+def _data(part: Part) -> Iterator[Any]:
     """The data of a file as (F, planes, Ny, Nx), x to the west, y to the north; a view of the file where possible."""
-    from astropy.io import fits
-    from astropy.utils.exceptions import AstropyWarning
-
-    try:
-        with warnings.catch_warnings(action="ignore", category=AstropyWarning), fits.open(part.path) as hdus:
-            array = hdus[part.hdu].data
-            roles: tuple[Role, ...] = ("freq", "stokes", "y", "x")
-            order = [array.ndim - part.axes[r] for r in roles if r in part.axes]
-            rest = [k for k in range(array.ndim) if k not in order]
-            array = np.transpose(array, rest + order)[(0,) * len(rest)]
-            array = np.expand_dims(array, [k for k, r in enumerate(roles) if r not in part.axes])
-            yield array[..., :: -1 if part.grid.flip_y else 1, :: -1 if part.grid.flip_x else 1]
-    except BROKEN as error:
-        raise FileError(f"{part.name}: its data cannot be read: {one_line(error)}") from None
+    with opened(part.path, "has data that cannot be read") as hdus:
+        array = hdus[part.hdu].data
+        roles: tuple[Role, ...] = ("freq", "stokes", "y", "x")
+        order = [array.ndim - part.axes[r] for r in roles if r in part.axes]
+        rest = [k for k in range(array.ndim) if k not in order]
+        array = np.transpose(array, rest + order)[(0,) * len(rest)]
+        array = np.expand_dims(array, [k for k, r in enumerate(roles) if r not in part.axes])
+        yield array[..., :: -1 if part.grid.flip_y else 1, :: -1 if part.grid.flip_x else 1]
 
 
-def _filled(parts: list[_Part], places: Places, freq: Float, psf: Psf | None) -> StokesCube:
+def _filled(parts: list[Part], places: Places, freq: Float, psf: Psf | None) -> StokesCube:
     from astropy import units as u
 
     first = parts[0]
     dtype = np.float64 if any(p.wide for p in parts) else np.float32
-    out = np.empty((len(freq), 4, *first.grid.shape), dtype)
+    shape = (len(freq), 4, *first.grid.shape)
+    need, there = float(np.prod(shape, dtype=float)) * np.dtype(dtype).itemsize, machine_memory()
+    if need > 0.75 * there:
+        size = f"{' x '.join(map(str, shape))} is {si_prefix(need, 'B')}, this machine has {si_prefix(there, 'B')}"
+        raise RefusedError(f"{first.name}: a cube of {size}: cut out channels or a part of the image")
+    out = np.empty(shape, dtype)
     beams = np.full((4, 3, len(freq)), np.nan)
     for name in NAMES:
         if name not in places:
@@ -278,13 +177,31 @@ def _filled(parts: list[_Part], places: Places, freq: Float, psf: Psf | None) ->
                 np.copyto(out[here, k], planes[:, plane], casting="same_kind")
                 if (factor := -part.factor if part.turns_u and name == "U" else part.factor) != 1:
                     out[here, k] *= factor
-                beams[k, :, here] = part.beams
+                if part.beams is not None:
+                    beams[k, :, here] = part.beams
     of = [beams[NAMES.index(name)] for name in places]
-    if psf is None and any(not np.allclose(b[:2], of[0][:2], rtol=1e-3, atol=0, equal_nan=True) for b in of[1:]):
-        said = f"beams differ between Stokes parameters: those of {next(iter(places))} are taken"
-        warnings.warn(said, InstrumentWarning, stacklevel=3)
+    if any(not np.allclose(b[:2], of[0][:2], rtol=1e-3, atol=0, equal_nan=True) for b in of[1:]):
+        first.notes.warned.append(f"beams differ between Stokes parameters: those of {next(iter(places))} are taken")
+    _say(parts)
     major, minor, angle = of[0]
     if psf is None and np.isfinite(major).any():
         psf = Psf.gaussian(major * u.rad, minor * u.rad, angle * u.rad)
     grid = first.grid
     return StokesCube(out, freq * u.Hz, grid.pixel_rad * u.rad, first.unit, grid.centre, psf)
+
+
+def _say(parts: list[Part]) -> None:
+    """Warn of what the files have in common once: a hundred channels need no hundred warnings."""
+    for text in dict.fromkeys(text for part in parts for text in part.notes.warned):
+        warnings.warn(text, InstrumentWarning, stacklevel=4)
+    found: dict[tuple[str, str], list[str]] = {}
+    for part in parts:
+        for note in part.notes.unused:
+            found.setdefault(note, []).append(part.name)
+    for (what, why), files in found.items():
+        more = f" and {len(files) - 1} more" if len(files) > 1 else ""
+        _unused(files[0] + more, what, why)
+
+
+def _unused(source: str, what: str, why: str) -> None:
+    warnings.warn(f"{source}: not used: {what} ({why})", InstrumentWarning, stacklevel=5)

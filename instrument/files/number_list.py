@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from instrument.errors import FileError
+from instrument.files_in import harmless, read_regular
 from instrument.units import Float
 
 MOST_BYTES = 16 << 20  # a million channels of 16 digits
@@ -19,18 +20,8 @@ def read_numbers(path: str | os.PathLike[str], what: str = "numbers") -> Float:
 
     Raises `FileError` in one line with the number of the line that is none.
     """
-    file = Path(path)
-    try:
-        if not file.is_file():
-            raise FileError(f"{path} does not exist" if not file.exists() else f"{path} is no plain file")
-        with file.open("rb") as opened:
-            content = opened.read(MOST_BYTES + 1)
-    except (OSError, ValueError) as error:
-        if isinstance(error, FileError):
-            raise
-        raise FileError(f"{file.name} cannot be read: {str(error).splitlines()[0]}") from None
-    if len(content) > MOST_BYTES:
-        raise FileError(f"{file.name} has more than {MOST_BYTES >> 20} MB: needed {what}, one a line")
+    content = read_regular(path, MOST_BYTES, "list of numbers")
+    name = harmless(Path(path).name)
     found = []
     for k, line in enumerate(content.decode("utf-8", errors="replace").splitlines(), 1):
         if not (text := line.partition("#")[0].strip()):
@@ -38,12 +29,12 @@ def read_numbers(path: str | os.PathLike[str], what: str = "numbers") -> Float:
         try:
             value = float(text)
         except ValueError:
-            raise FileError(f"{file.name}, line {k}: not a number; needed {what}, one a line") from None
+            raise FileError(f"{name}, line {k}: not a number; needed {what}, one a line") from None
         if not np.isfinite(value):
-            raise FileError(f"{file.name}, line {k}: {value} is not finite; needed {what}, one a line")
+            raise FileError(f"{name}, line {k}: {value} is not finite; needed {what}, one a line")
         found.append(value)
     if not found:
-        raise FileError(f"{file.name} holds no number: needed {what}, one a line")
+        raise FileError(f"{name} holds no number: needed {what}, one a line")
     return np.array(found)
 
 

@@ -79,7 +79,7 @@ def test_e13_frequencies_and_weights_of_a_text_file(tmp_path):
         with pytest.raises(FileError, match=said) as caught:
             read_numbers(path)
         assert "root" not in str(caught.value)
-    for wrong, said in ((tmp_path, "no plain file"), (tmp_path / "none", "does not exist")):
+    for wrong, said in ((tmp_path, "is a folder"), (tmp_path / "none", "no list of numbers")):
         with pytest.raises(FileError, match=said):
             read_numbers(wrong)
 

@@ -116,7 +116,7 @@ def test_frequencies_are_read_in_their_unit_and_from_their_reference_channel(pat
         ({"CUNIT3": "m/s"}, "CUNIT3 = 'm/s' is not Hz, kHz, MHz or GHz"),
         ({"CRVAL3": None}, "CRVAL3 is missing"),
         ({"CRVAL3": "high"}, "CRVAL3 = 'high' is not a number"),
-        ({"CRVAL3": -1e6}, "axis 3 .FREQ. has -1e.06 Hz: CRVAL3 or CDELT3 is wrong"),
+        ({"CRVAL3": -1e6}, "axis 3 .FREQ. has -1e.06 Hz .CUNIT3 = .Hz.., not 1 MHz to 10 THz"),
         ({"CDELT3": 0.0}, "axis 3 has the step 0"),
         ({"CDELT2": 1 / 60}, "pixels are 0.5' x 1' .axes 1 and 2.: regrid to square ones"),
         ({"CROTA2": 12.0}, "CROTA2 = 12 deg: the image is turned"),
@@ -134,9 +134,9 @@ def test_frequencies_are_read_in_their_unit_and_from_their_reference_channel(pat
         ({"BUNIT": "Jy/sr"}, "BUNIT = 'Jy/sr' is not"),
         ({"BMAJ": "3 arcmin"}, "BMAJ = '3 arcmin' is not a number"),
         ({"POLCCONV": "Stokes"}, "POLCCONV = 'STOKES' is neither IAU nor COSMO"),
-        ({"CRVAL4": -5.0, "CDELT4": -1.0}, "axis 4 .STOKES. has XX .code -5.: make I, Q, U, V of it"),
-        ({"CRVAL4": 2.0}, "axis 4 .STOKES. has what is not known .code 5."),
-        ({"CDELT4": 0.5}, "axis 4 .STOKES. has what is not known .code 1.5."),
+        ({"CRVAL4": -5.0, "CDELT4": -1.0}, "axis 4 .STOKES. has XX: make I, Q, U, V of it"),
+        ({"CRVAL4": 2.0}, "axis 4 .STOKES. has code 5"),
+        ({"CDELT4": 0.5}, "axis 4 .STOKES. has code 1.5"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_read_is_refused_with_its_axis_or_keyword(path, cards, said):
@@ -381,8 +381,8 @@ def test_reading_takes_the_memory_of_the_cube_once(path):
 
 
 def test_broken_files_are_named(tmp_path):
-    refused(FileError, "nothing.fits does not exist", tmp_path / "nothing.fits")
-    refused(FileError, "is not a readable FITS file", tmp_path)
+    refused(FileError, "no FITS file '.*nothing.fits'", tmp_path / "nothing.fits")
+    refused(FileError, "is a folder; name the FITS file in it", tmp_path)
     (tmp_path / "text.fits").write_text("hello")
     refused(FileError, "text.fits is not a readable FITS file", tmp_path / "text.fits")
     (tmp_path / "empty.fits").write_bytes(b"")
@@ -393,4 +393,4 @@ def test_broken_files_are_named(tmp_path):
         tmp_path / "whole.fits", np.zeros((8, 4, 64, 64), np.float32), CRPIX1=33.0, CRPIX2=33.0
     ).read_bytes()
     (tmp_path / "short.fits").write_bytes(whole[: len(whole) // 2])
-    refused(FileError, "short.fits: its data cannot be read", tmp_path / "short.fits")
+    refused(FileError, "short.fits: its header declares data of 64 x 64 x 8 x 4, 524 kB", tmp_path / "short.fits")
