@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,13 +11,13 @@ from typing import Any, get_args
 
 import numpy as np
 
-from instrument.errors import FileError, InputError, InstrumentWarning, RefusedError
+from instrument.errors import FileError, InputError, unused, warn
 from instrument.files.fits_axes import Role
-from instrument.files.fits_header import Given, Part, look
+from instrument.files.fits_header import Given, Part, affordable, look
 from instrument.files.fits_open import opened
+from instrument.files_in import harmless
 from instrument.image.cube import Psf, StokesCube, Unit
-from instrument.planner import machine_memory
-from instrument.units import Float, si_prefix, to_si
+from instrument.units import Float, to_si
 
 NAMES = "IQUV"
 MFS = re.compile(r"(.*)-MFS(-.*)")  # WSClean: the mean of all channels, beside NAME-0000, NAME-0001, ...
@@ -33,11 +32,13 @@ def read_cube(
 ) -> StokesCube:
     """Cube (F, 4, Ny, Nx) of FITS images, float32 (float64 where a file is), NaN for Stokes parameters that none has.
 
-    Axes RA, DEC, FREQ and STOKES are found by CTYPE, in any order; FREQ is linear in Hz, kHz, MHz or GHz, or a column
-    FREQ of a table BEAMS. Files are put together by Stokes parameter, and along frequency in the order given. `stokes`
-    ("Q,U"), `unit`, `frequencies` (with a unit) and `psf` stand for what the headers do not say, or say wrongly. Beams
-    come from the table BEAMS (CASA's, ours) or BMAJ, BMIN, BPA. x is turned to run west, y north; U of POLCCONV =
-    'COSMO' changes sign. Raises `FileError` or `InputError` in one line with file, axis or keyword, value and remedy.
+    Axes RA, DEC, FREQ and STOKES are found by CTYPE, in any order; FREQ is linear in Hz, kHz, MHz or GHz, a table
+    (FREQ-TAB), or a column FREQ of a table BEAMS. Files are put together by Stokes parameter, and along frequency in
+    the order given; the mean of all channels (-MFS-) that WSClean puts beside them is left out. `stokes` ("Q,U"),
+    `unit`, `frequencies` (with a unit) and `psf` stand for what the headers do not say. Beams come from the table BEAMS
+    (CASA's, ours), BMAJ1 and so on, BMAJ, or AIPS's history. x is turned to run west, y north; U of POLCCONV = 'COSMO'
+    changes sign. What was not used is named in warnings. Raises `FileError` or `InputError` in one line with file, axis
+    or keyword, value and remedy.
     """
     if not paths:
         raise InputError('read_cube needs a file: read_cube("cube.fits"), or one for each Stokes parameter')
@@ -67,7 +68,7 @@ def _channels_alone(paths: Sequence[Any]) -> list[Any]:
     for path, name in zip(paths, names, strict=True):
         mean = MFS.fullmatch(name)
         if mean and any(re.fullmatch(re.escape(mean[1]) + r"-\d+" + re.escape(mean[2]), other) for other in names):
-            _unused(name, "all of it", "the mean of all channels, no channel of its own")
+            unused(harmless(name), ["all of it"], "the mean of all channels, no channel of its own")
         else:
             kept.append(path)
     return kept
@@ -160,10 +161,7 @@ def _filled(parts: list[Part], places: Places, freq: Float, psf: Psf | None) -> 
     first = parts[0]
     dtype = np.float64 if any(p.wide for p in parts) else np.float32
     shape = (len(freq), 4, *first.grid.shape)
-    need, there = float(np.prod(shape, dtype=float)) * np.dtype(dtype).itemsize, machine_memory()
-    if need > 0.75 * there:
-        size = f"{' x '.join(map(str, shape))} is {si_prefix(need, 'B')}, this machine has {si_prefix(there, 'B')}"
-        raise RefusedError(f"{first.name}: a cube of {size}: cut out channels or a part of the image")
+    affordable(first.name, len(freq), *first.grid.shape, dtype == np.float64)
     out = np.empty(shape, dtype)
     beams = np.full((4, 3, len(freq)), np.nan)
     for name in NAMES:
@@ -193,15 +191,10 @@ def _filled(parts: list[Part], places: Places, freq: Float, psf: Psf | None) -> 
 def _say(parts: list[Part]) -> None:
     """Warn of what the files have in common once: a hundred channels need no hundred warnings."""
     for text in dict.fromkeys(text for part in parts for text in part.notes.warned):
-        warnings.warn(text, InstrumentWarning, stacklevel=4)
+        warn(text)
     found: dict[tuple[str, str], list[str]] = {}
     for part in parts:
         for note in part.notes.unused:
             found.setdefault(note, []).append(part.name)
     for (what, why), files in found.items():
-        more = f" and {len(files) - 1} more" if len(files) > 1 else ""
-        _unused(files[0] + more, what, why)
-
-
-def _unused(source: str, what: str, why: str) -> None:
-    warnings.warn(f"{source}: not used: {what} ({why})", InstrumentWarning, stacklevel=5)
+        unused(files[0] + (f" and {len(files) - 1} more" if len(files) > 1 else ""), [what], why)

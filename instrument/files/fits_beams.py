@@ -10,7 +10,7 @@ import numpy as np
 from instrument.errors import FileError
 from instrument.files.fits_axes import Notes, number
 from instrument.files.fits_sky import Grid
-from instrument.units import Bool, Float, to_si
+from instrument.units import Bool, Float
 
 KEYS = ("BMAJ", "BMIN", "BPA")
 AIPS = re.compile(r"AIPS\s+CLEAN\s+BMAJ=\s*(\S+)\s+BMIN=\s*(\S+)\s+BPA=\s*(\S+)")
@@ -22,7 +22,7 @@ def beams_of(file: str, header: Any, table: Any, channels: int, grid: Grid, note
 
     Raises `FileError` for a beam that is wider than the image or narrower than a pixel: its unit is not what it says.
     """
-    first = next((k for k in (1, 0) if f"BMAJ{k}" in header), None)
+    first = next((k for k in (0, 1) if f"BMAJ{k}" in header), None)
     if table is not None and {"BMAJ", "BMIN"} <= set(table.columns.names):
         source, found = "the table BEAMS", _of_table(file, header, table, channels, grid, notes)
     elif first is not None:
@@ -81,7 +81,7 @@ def _of_table(file: str, header: Any, table: Any, channels: int, grid: Grid, not
         units[:2] = [_guessed(file, header, values[0], grid, notes)] * 2
     return np.stack(
         [
-            to_si(value * _angle(file, unit or ("deg" if k == "BPA" else units[0])), "rad", k)
+            value * _radians(file, unit or ("deg" if k == "BPA" else units[0]))
             for k, value, unit in zip(KEYS, values, units, strict=True)
         ]
     )
@@ -103,13 +103,13 @@ def _guessed(file: str, header: Any, major: Float, grid: Grid, notes: Notes) -> 
     return fits[0]
 
 
-def _angle(file: str, text: str) -> Any:
+def _radians(file: str, text: str) -> float:
     from astropy import units as u
 
     unit = u.Unit(text, parse_strict="silent")
     if not unit.is_equivalent(u.rad):
         raise FileError(f"{file}: the table BEAMS has the unit '{text}': needed deg, arcsec or rad")
-    return unit
+    return float(unit.to(u.rad))
 
 
 def _odd(major_rad: Float, grid: Grid) -> tuple[Bool, Bool]:

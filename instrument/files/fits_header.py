@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from instrument.errors import FileError, InputError
+from instrument.errors import FileError, InputError, RefusedError
 from instrument.files.fits_axes import Notes, Role, axes_of, only_iquv, stokes_of
 from instrument.files.fits_beams import beams_of
 from instrument.files.fits_open import opened, units_of
@@ -15,11 +15,13 @@ from instrument.files.fits_sky import Grid, grid_of
 from instrument.files.fits_spectral import frequencies_of, plausible
 from instrument.files_in import harmless
 from instrument.image.cube import Unit
-from instrument.units import Float
+from instrument.planner import machine_memory
+from instrument.units import Float, si_prefix
 
 # with spaces, dots and asterisks left out; of BUNIT in capitals only what cannot be read in two ways
 FLUX = re.compile(r"([mµuμ]?)jy(?:/|per)?(?:(beam|bm)|(pixel|pix))(?:-1|\^-1)?|(?:beam|bm)-1([mµuμ]?)jy")
 PREFIX = {"": 1.0, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6}
+MOST_CHANNELS = 1 << 20
 KELVIN = {"K": 1.0, "mK": 1e-3, "uK": 1e-6, "µK": 1e-6, "μK": 1e-6}
 
 
@@ -79,11 +81,12 @@ def _described(path: Path, k: int, hdus: Any, others: list[tuple[int, Any]], giv
     if "freq" not in axes and not given.frequencies:
         raise FileError(f"{file}: no axis is FREQ: give frequencies=")
     channels = int(header[f"NAXIS{axes['freq']}"]) if "freq" in axes else 1
+    affordable(file, channels, header[f"NAXIS{axes['y']}"], header[f"NAXIS{axes['x']}"], header["BITPIX"] == -64)
     found, said = _names(file, header, axes, given)
     table = next((h for _, h in others if h.name == "BEAMS" and not h.is_image), None)
     tables = {str(header.get(f"PS{axes['freq']}_0", "")).strip().upper()} if "freq" in axes else set()
     for number, hdu in others:
-        if hdu is not table and (hdu.is_image or hdu.name not in tables):
+        if hdu is not table and (hdu.is_image or hdu.name not in tables - {""}):
             kind = "image" if hdu.is_image else "table"
             notes.unused.append((f"extension {number} ({kind} {hdu.name or 'without a name'})", "the image is another"))
     freq: Float | None = None
@@ -102,6 +105,14 @@ def _described(path: Path, k: int, hdus: Any, others: list[tuple[int, Any]], giv
     beams = None if given.beam else beams_of(file, header, table, channels, grid, notes)
     wide, turns = header["BITPIX"] == -64, convention == "COSMO"
     return Part(path, k, axes, grid, channels, freq, found, said, *of_unit, turns, beams, wide, notes)
+
+
+def affordable(file: str, channels: int, ny: int, nx: int, wide: bool) -> None:
+    """Raises `RefusedError` for a cube (F, 4, Ny, Nx) that this machine does not hold, before any of it is made."""
+    need, there = channels * 4.0 * ny * nx * (8 if wide else 4), machine_memory()
+    if need > 0.75 * there or channels > MOST_CHANNELS:
+        size = f"{channels} x 4 x {ny} x {nx} is {si_prefix(need, 'B')}, this machine has {si_prefix(there, 'B')}"
+        raise RefusedError(f"{file}: a cube of {size}: cut out channels or a part of the image")
 
 
 def _names(file: str, header: Any, axes: dict[Role, int], given: Given) -> tuple[list[str], list[str]]:

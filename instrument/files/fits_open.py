@@ -18,6 +18,7 @@ from instrument.units import si_prefix
 PACKED: dict[bytes, Any] = {b"\x1f\x8b": gzip.GzipFile, b"BZh": bz2.BZ2File, b"\xfd7zXZ": lzma.LZMAFile}
 MOST_TIMES = 100  # a packed file may unpack to: images of noise shrink to 0.8, masks to 0.05; a bomb to 0.001
 MOST_UNITS = 4096  # HDUs of a file
+MOST_COLUMNS = 999  # of a table, as the standard has it: more are made one by one, for hours
 
 
 class _Unpacked:
@@ -99,6 +100,8 @@ def units_of(hdus: Any, name: str) -> Iterator[tuple[int, Any]]:
             hdu = hdus[k]
         except IndexError:
             return
+        if not hdu.is_image and not 0 <= int(hdu.header.get("TFIELDS", 0)) <= MOST_COLUMNS:
+            raise FileError(f"{name}: a table of {hdu.header['TFIELDS']} columns, FITS has at most {MOST_COLUMNS}")
         place = hdu.fileinfo()
         there, start = int(place["file"].size), int(place["datLoc"])
         declared = int(hdu.size)

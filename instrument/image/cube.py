@@ -10,9 +10,9 @@ import numpy as np
 
 from instrument.errors import InputError
 from instrument.image.channels import channel_index, in_band
+from instrument.image.cube_file import write_cube
 from instrument.observe.directions import LIGHT
 from instrument.units import Direction, Float, to_si
-from instrument.whole_file import whole_file
 
 BOLTZMANN = 1.380649e-23  # J/K
 JY = 1e-26  # W m^-2 Hz^-1
@@ -38,7 +38,8 @@ class Psf:
     def gaussian(cls, major: Any, minor: Any = None, angle: Any = None) -> Psf:
         """A Gaussian beam known by its widths alone: full widths at half maximum and position angle, one or (F,) each.
 
-        Quantities; `minor` is `major` unless given, `angle` (of the major axis, north through east) is 0.
+        Quantities, NaN where a channel has none; `minor` is `major` unless given, `angle` (of the major axis, north
+        through east) is 0.
         """
         widths = (
             to_si(m, "rad", n, nan=True) for m, n in ((major, "major"), (major if minor is None else minor, "minor"))
@@ -204,34 +205,10 @@ class StokesCube:
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write a FITS cube in float32 (Stokes and frequency axes, IAU polarization, restoring beam), whole or not.
 
-        Beams of many channels, and frequencies that are not even, are in a table BEAMS; `read_cube` reads both back.
+        Beams of many channels are in a table BEAMS; frequencies that are not even make an axis FREQ-TAB with its table
+        (FITS paper III), which programs that know it not refuse rather than misread. `read_cube` reads both back.
         """
-        from astropy.io import fits
-
-        wcs = self.wcs.wcs
-        even = wcs.crval[3] + wcs.cdelt[3] * np.arange(len(self.freq_hz))
-        header = self.wcs.to_header()
-        for name, values in (("CRVAL", wcs.crval), ("CDELT", wcs.cdelt)):  # all digits: astropy writes twelve
-            header.update({f"{name}{i + 1}": float(value) for i, value in enumerate(values)})
-        header["BUNIT"] = self.unit
-        header["POLCCONV"] = ("IAU", "U and V: x north, y east, V right-handed")
-        header["ORIGIN"] = "instrument"
-        if self.centre is None:
-            header["NOCENTRE"] = (True, "the centre is not known: 0, 0 stands for it")
-        hdus = [fits.PrimaryHDU(np.asarray(self.data, np.float32), header=header)]
-        known: Any = [] if self.psf is None else np.flatnonzero(np.isfinite(self.psf.major_rad))
-        if self.psf is not None and len(known):  # FITS has no NaN in a header: the first channel with a beam
-            beam, first = hdus[0].header, known[0]
-            beam["BMAJ"], beam["BMIN"] = np.rad2deg(self.psf.major_rad[first]), np.rad2deg(self.psf.minor_rad[first])
-            beam["BPA"] = np.rad2deg(self.psf.angle_rad[first])
-        if len(self.freq_hz) > 1 and (self.psf is not None or not np.allclose(self.freq_hz, even, rtol=1e-12, atol=0)):
-            columns = [fits.Column("FREQ", "D", "Hz", array=self.freq_hz)]
-            if self.psf is not None:
-                widths = {"BMAJ": self.psf.major_rad, "BMIN": self.psf.minor_rad, "BPA": self.psf.angle_rad}
-                columns += [fits.Column(name, "D", "deg", array=np.rad2deg(x)) for name, x in widths.items()]
-            hdus.append(fits.BinTableHDU.from_columns(columns, name="BEAMS"))
-        with whole_file(path) as partial:
-            fits.HDUList(hdus).writeto(partial, overwrite=True)
+        write_cube(self, path)
 
 
 def listing(wrong: Any) -> str:

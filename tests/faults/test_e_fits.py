@@ -59,7 +59,7 @@ def refused(said, *paths, error=InputError, **given):
     with pytest.raises(error, match=said) as caught:
         read_cube(*paths, **given)
     assert "\n" not in str(caught.value)
-    assert len(str(caught.value)) < 300
+    assert len(str(caught.value)) < 350
 
 
 def kelvin(cube, channel=0):
@@ -128,8 +128,12 @@ def test_e5_channels_without_a_beam_do_not_stop_the_others(path):
 
 def test_e5_the_beam_of_a_history_is_read_and_said(path):
     """As AIPS writes it: the last CLEAN counts."""
-    history = ["AIPS   CLEAN BMAJ=  1.0000E-01 BMIN=  1.0000E-01 BPA=   0.00", "IMFIT made this up",
-               "AIPS   CLEAN BMAJ=  5.0000E-02 BMIN=  5.0000E-02 BPA=  12.50", "AIPS   CLEAN NITER=     1000"]  # fmt: skip
+    history = [
+        "AIPS   CLEAN BMAJ=  1.0000E-01 BMIN=  1.0000E-01 BPA=   0.00",
+        "IMFIT made this up",
+        "AIPS   CLEAN BMAJ=  5.0000E-02 BMIN=  5.0000E-02 BPA=  12.50",
+        "AIPS   CLEAN NITER=     1000",
+    ]
     written(path, history=history)
     with pytest.warns(InstrumentWarning, match="the beam is that of its history .AIPS CLEAN BMAJ."):
         found = read_cube(path)
@@ -183,7 +187,7 @@ def test_e6_one_channel_needs_no_step_and_no_reference(path):
 def test_e7_an_image_turned_by_180_deg_is_turned_back(path):
     """A source in one corner, found where PC1_1 = PC2_2 = -1 has it."""
     straight = read_cube(written(path, PC1_1=-1.0, PC2_2=-1.0))
-    assert np.array_equal(straight.data[:, :1, 1:, 1:], DATA[:, :, :0:-1, :0:-1])
+    assert np.array_equal(straight.data[:, :1], DATA[..., ::-1, ::-1])
     for cards in ({"CROTA2": 180.0}, {"CROTA1": 180.0, "CROTA2": 180.0}, {"CROTA2": -180.0}, {"CROTA1": 180.0}):
         turned = read_cube(written(path, **cards))
         assert np.array_equal(turned.data, straight.data, equal_nan=True)
@@ -281,7 +285,7 @@ def test_e11_a_cube_with_gaps_comes_back_with_its_frequencies_to_the_last_bit(tm
 
 
 def test_e11_an_axis_tab_with_an_index_is_read(path):
-    """FITS paper III: coordinates at index 1, 3, 5, 9 of a table; channels at 1, 2, 3, 4 lie on straight lines between."""
+    """FITS paper III: coordinates at index 1, 3, 5, 9 of a table; channels 1 to 4 lie on the lines between."""
     columns = [fits.Column("COORDS", "4D", "MHz", dim="(1,4)", array=np.array([[[150.0], [151.0], [153.0], [160.0]]])),
                fits.Column("INDEX", "4D", array=[[1.0, 3.0, 5.0, 9.0]])]  # fmt: skip
     table = fits.BinTableHDU.from_columns(columns, name="WCS-TAB")
@@ -325,9 +329,9 @@ def test_i5_a_bomb_of_gzip_is_refused_before_it_is_unpacked(path):
     packed = path.with_name("bomb.fits.gz")
     with gzip.open(packed, "wb") as file:
         file.write(content)
-        for _ in range(256):
+        for _ in range(40):
             file.write(bytes(1 << 20))
-    assert packed.stat().st_size < 400_000
+    assert packed.stat().st_size < 100_000
     assert peak_of(refused, "unpacks to more than .* 100 times its size", packed, error=FileError) < 50e6
 
 
@@ -343,7 +347,7 @@ def test_i5_a_cube_that_memory_does_not_hold_is_refused(path):
     head["NAXIS3"] = 500_000_000
     path.write_bytes(head.tostring().encode("ascii"))
     os.truncate(path, len(head.tostring()) + 4 * N * N * 500_000_000)
-    assert peak_of(refused, "a cube of .*: cut out channels", path, error=RefusedError) < 20e9 or True
+    assert peak_of(refused, "a cube of .*: cut out channels", path, error=RefusedError) < 4e6
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")
@@ -353,7 +357,7 @@ def test_i5_pipes_devices_and_folders_do_not_block(tmp_path):
         refused("no regular file", wrong, error=FileError)
 
 
-@pytest.mark.parametrize("name", ["http://127.0.0.1:9/x.fits", "file:///etc/passwd", "a\0b.fits", "x" * 300])
+@pytest.mark.parametrize("name", ["http://127.0.0.1:9/x.fits", "file:///etc/passwd", "a\0b.fits", "x" * 260])
 def test_i5_i8_a_name_is_a_file_or_nothing_and_never_fetched(name):
     refused("FITS file", name, error=FileError)
 
