@@ -15,7 +15,7 @@ from instrument.files.fits_sky import Grid, grid_of
 from instrument.files.fits_spectral import frequencies_of, plausible
 from instrument.files_in import harmless
 from instrument.image.cube import Unit
-from instrument.planner import machine_memory
+from instrument.memory import machine_memory
 from instrument.units import Float, si_prefix
 
 # with spaces, dots and asterisks left out; of BUNIT in capitals only what cannot be read in two ways
