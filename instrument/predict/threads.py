@@ -22,6 +22,7 @@ class OneThread:
     def __enter__(self) -> None:
         with self.lock:
             if self.inside == 0:
+                _release()
                 self.limit = _controller().limit(limits=1)
             self.inside += 1
 
@@ -29,7 +30,9 @@ class OneThread:
         with self.lock:
             self.inside -= 1
             if self.inside == 0 and self.limit is not None:
+                _release()
                 self.limit.restore_original_limits()
+                _release()
                 self.limit = None
 
 
@@ -38,6 +41,14 @@ def _controller() -> Any:
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()  # looks through all loaded libraries: 2 ms
+
+
+def _release() -> None:
+    """Let this thread set the limit: new threadpoolctl listens to the first thread that did, and to no other."""
+    for library in _controller().lib_controllers:
+        clear = getattr(library, "clear_controlling_thread", None)
+        if clear is not None:
+            clear(force=True)
 
 
 def look_again() -> None:
