@@ -10,7 +10,6 @@ arcsec, and "MajorAxis" may be the shorter one: the orientation belongs to it.
 from __future__ import annotations
 
 import re
-import warnings
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,11 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from instrument.errors import InputError, InstrumentWarning, did_you_mean
+from instrument.errors import InputError, did_you_mean, unused, warn
+from instrument.files_in import SHOWN, harmless
 from instrument.observe.directions import LIGHT, tangents
 from instrument.sky.bbs_text import Line, angle, broken, lines_of
 from instrument.sky.points import PointSky
 from instrument.units import Direction, Float
+from instrument.whole_file import whole_file
 
 ARCSEC = np.pi / 180 / 3600
 MISORIENTED = np.deg2rad(0.1)  # orientations of fitted components are rarely better than a degree
@@ -34,6 +35,13 @@ def _shape(line: Line) -> tuple[float, float, float]:
     if kind not in ("", "point", "gaussian"):
         raise line.fail(f"Type = '{line['Type']}' cannot be kept; POINT and GAUSSIAN can, remove or replace the source")
     if kind == "point":
+        for field in ("MajorAxis", "MinorAxis", "Orientation"):
+            if line[field].startswith("["):  # a spectral index, say: the columns are shifted
+                shown = harmless(line[field], SHOWN)
+                raise line.fail(
+                    f"Type is POINT but {field} = '{shown}'; put the columns in the order of the format line"
+                )
+            line.real(field, 0.0)
         return 0.0, 0.0, 0.0
     if not kind:
         if line.real("MajorAxis", 0.0) or line.real("MinorAxis", 0.0):
@@ -106,15 +114,15 @@ def read_bbs(path: Path, text: Sequence[str], centre: Direction | None = None) -
     are not kept: a patch is a name.
     """
     patches: set[str] = set()
-    names: dict[str, int] = {}
-    rows = []
+    names: dict[tuple[str, str], int] = {}
+    rows, flat, without_name = [], [], []
     for line in lines_of(path, text):
         name, patch = line["Name"], line["Patch"]
-        if not name:
-            if not patch or line["Type"]:
-                raise line.fail(
-                    "no Name; a source needs one, and a patch is a line with Patch but neither Name nor Type"
-                )
+        if not name:  # a patch, also where its line carries a Type
+            if not patch:
+                raise line.fail("no Name; a source needs one, and a patch is a line with Patch but no Name")
+            if line.real("I", 0.0):
+                without_name.append(f"line {line.number}")
             if patch in patches:
                 raise line.fail(f"patch '{patch}' is defined twice; remove one")
             patches.add(patch)
@@ -123,13 +131,40 @@ def read_bbs(path: Path, text: Sequence[str], centre: Direction | None = None) -
         if patch and patch not in patches:
             hint = did_you_mean(patch, patches)
             raise line.fail(f"patch '{patch}' is not defined before the source that uses it: {hint}")
-        if name in names:
-            raise line.fail(f"source '{name}' was there before, on line {names[name]}; rename or remove one")
-        names[name] = line.number
+        if (patch, name) in names:
+            earlier = names[patch, name]
+            raise line.fail(f"source '{name}' was there before, on line {earlier}; rename or remove one")
+        names[patch, name] = line.number
         rows.append(_source(line))
+        if line["Type"].lower() == "point" and (line.real("MajorAxis", 0.0) or line.real("MinorAxis", 0.0)):
+            flat.append(f"line {line.number}")
     if not rows:
         raise broken(path, None, "no source in it")
+    unused(harmless(path.name), flat, "axes of a POINT")
+    unused(harmless(path.name), without_name, "a patch has no flux, and a source needs a Name")
+    _unique(path, rows)
     return _sky(path, rows, centre)
+
+
+def _unique(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Names that stand in several patches become "patch:name" after the first: only so can they be written back."""
+    taken = {r["name"] for r in rows}
+    seen: set[str] = set()
+    made: list[str] = []
+    for row in rows:
+        if row["name"] in seen:
+            row["name"] = f"{row['patch']}:{row['name']}"
+            while row["name"] in taken:
+                row["name"] += "+"
+            made.append(row["name"])
+            taken.add(row["name"])
+        seen.add(row["name"])
+    if made:
+        names, what = ("name stands", "is") if len(made) == 1 else ("names stand", "are")
+        warn(
+            f"{harmless(path.name)}: {len(made)} {names} in several patches and {what} made unique by the patch, as "
+            f"'{harmless(made[0], 60)}'"
+        )
 
 
 def _sky(path: Path, rows: list[dict[str, Any]], centre: Direction | None) -> PointSky:
@@ -178,12 +213,10 @@ def _convergence(path: Path, sky: PointSky, centre: Direction | None, turned: An
         return np.asarray(turn)
     worst = np.abs(turn[turned]).max(initial=0.0)
     if worst > MISORIENTED:
-        warnings.warn(
-            f"{path.name}: {turned.sum()} orientations count from the phase centre of the model, which is not given, "
-            f"and are taken as angles at the sources; about the middle of the file that turns them by up to "
-            f"{np.rad2deg(worst):.2g} deg; give it as read(path, centre=...)",
-            InstrumentWarning,
-            stacklevel=4,
+        warn(
+            f"{harmless(path.name)}: {turned.sum()} orientations count from the phase centre of the model, which is not "
+            f"given, and are taken as angles at the sources; about the middle of the file that turns them by up to "
+            f"{np.rad2deg(worst):.2g} deg; give it as read(path, centre=...)"
         )
     return 0.0
 
@@ -209,7 +242,8 @@ def write_bbs(path: Any, sky: PointSky) -> None:
         middle = sky.select([k for k, p in enumerate(sky.patches) if p == patch]).middle
         out.append(f", , {patch}, {_degrees(middle.ra_rad)}, {_degrees(middle.dec_rad)}")
     out += [", ".join(row[k] for k in used) for row in rows]
-    Path(path).write_text("\n".join(out) + "\n", encoding="utf-8")
+    with whole_file(path) as partial:
+        partial.write_text("\n".join(out) + "\n", encoding="utf-8")
 
 
 def _check_names(sky: PointSky) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from instrument.errors import FileError, did_you_mean
+from instrument.errors import FileError, did_you_mean, unused
 from instrument.files_in import harmless
 
 FIELDS = (
@@ -20,18 +20,20 @@ FIELDS = (
 )  # fmt: skip
 KNOWN = {name.lower(): name for name in FIELDS}
 SKIPPED = {"", "dummy", "category", "ishapelet", "qshapelet", "ushapelet", "vshapelet"}
+LINES_AT_MOST = 500_000  # 2 kB of numbers and names a source: 1 GB
 WITHOUT_FORMAT_LINE = "Name,Type,Ra,Dec,I,Q,U,V,MajorAxis,MinorAxis,Orientation"
 FORMAT = re.compile(r"\s*(?:#\s*\((?P<hash>.*)\)\s*=\s*format\s*$|format\s*=(?P<plain>.*))", re.IGNORECASE)
 FIELD = re.compile(r"(?P<name>[\w:]*)\s*(?:=\s*(?P<fixed>fixed)?\s*(?P<quote>['\"])(?P<value>.*)(?P=quote))?", re.I)
-HOURS = re.compile(r"([+-]?)(\d+)(?::(\d+):(\d+\.?\d*)|h(\d+)m(\d+\.?\d*)s?)")
-DEGREES = re.compile(r"([+-]?)(\d+)(?:\.(\d+)\.(\d+\.?\d*)|d(\d+)m(\d+\.?\d*)s?)")
+SECONDS = r"(\d+\.?\d*(?:e[+-]?\d+)?)"  # 05.1e-12 is how Python writes a few picoseconds of arc
+HOURS = re.compile(rf"([+-]?)(\d+)(?::(\d+):{SECONDS}|h(\d+)m{SECONDS}s?)", re.IGNORECASE)
+DEGREES = re.compile(rf"([+-]?)(\d+)(?:\.(\d+)\.{SECONDS}|d(\d+)m{SECONDS}s?)", re.IGNORECASE)
 WITH_UNIT = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*(deg|rad)", re.IGNORECASE)
 
 
 def broken(path: Path, line: int | None, message: str, kind: str = "line") -> FileError:
     """The one-line error of a file: its name, the line or row, what is wrong and the remedy."""
     where = f", {kind} {line}" if line is not None else ""
-    return FileError(f"{harmless(path.name)}{where}: {harmless(message)}")
+    return FileError(f"{harmless(path.name)}{where}: {harmless(message, 600)}")
 
 
 @dataclass(frozen=True)
@@ -137,8 +139,11 @@ def is_bbs(lines: Sequence[str]) -> bool:
 
 def lines_of(path: Path, text: Sequence[str]) -> list[Line]:
     """The data lines with their fields named, defaults filled in."""
+    if len(text) > LINES_AT_MOST:
+        raise broken(path, None, f"{len(text):,} lines; at most {LINES_AT_MOST:,} are read: cut out what is needed")
     fields = None
     found = []
+    skipped: set[str] = set()
     for number, raw in enumerate(text, 1):
         header = FORMAT.match(raw)
         if header and (fields is None or header["plain"] is not None):
@@ -164,8 +169,15 @@ def lines_of(path: Path, text: Sequence[str]) -> list[Line]:
             if len(value) > 1 and value[0] in "'\"" and value[0] == value[-1]:
                 value = value[1:-1].strip()
             values[name] = value or default or ""
+            if value and name in SKIPPED and name not in ("", "dummy"):
+                skipped.add(name)
         found.append(Line(path, number, values))
+    unused(harmless(path.name), sorted(name.capitalize() for name in skipped))
     return found
+
+
+def _below_sixty(minutes: float, seconds: float) -> bool:
+    return minutes < 60 and seconds <= 60  # 12:34:60.0 is what rounding makes of 59.9999
 
 
 def angle(line: Line, field: str) -> float | None:
@@ -179,7 +191,7 @@ def angle(line: Line, field: str) -> float | None:
         if number:
             scale = 1.0 if number[2].lower() == "deg" else 180 / np.pi
             degrees = float(number[1]) * scale
-        elif sexagesimal and all(float(x) < 60 for x in sexagesimal.groups()[2:] if x):
+        elif sexagesimal and _below_sixty(*(float(x) for x in sexagesimal.groups()[2:] if x)):
             sign, whole, *rest = sexagesimal.groups()
             minutes, seconds = (float(x) for x in rest if x is not None)
             degrees = (float(whole) + minutes / 60 + seconds / 3600) * (-1 if sign == "-" else 1) * (15 if right else 1)

@@ -116,7 +116,7 @@ def _head(raw: bytes) -> list[str]:
 
 def _lines(file: Path, raw: bytes) -> list[str]:
     try:
-        lines = raw.decode("utf-8-sig").splitlines()
+        lines = raw.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n").split("\n")
     except UnicodeDecodeError as error:
         raise broken(file, raw[: error.start].count(b"\n") + 1, "not UTF-8 text; save it as such") from None
     if not any(t.strip() for t in lines):
