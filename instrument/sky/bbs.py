@@ -214,8 +214,8 @@ def _convergence(path: Path, sky: PointSky, centre: Direction | None, turned: An
     worst = np.abs(turn[turned]).max(initial=0.0)
     if worst > MISORIENTED:
         warn(
-            f"{harmless(path.name)}: {turned.sum()} orientations count from the phase centre of the model, which is not "
-            f"given, and are taken as angles at the sources; about the middle of the file that turns them by up to "
+            f"{harmless(path.name)}: {turned.sum()} orientations count from the phase centre of the model, which is "
+            f"not given, and are taken as angles at the sources; about the middle of the file that turns them by up to "
             f"{np.rad2deg(worst):.2g} deg; give it as read(path, centre=...)"
         )
     return 0.0
