@@ -18,7 +18,7 @@ from instrument.jones.gain import GainTerm
 from instrument.jones.mueller import mueller
 from instrument.observe.layout import Layout
 from instrument.observe.sampling import Sampling
-from instrument.units import Complex, Direction, Float, direction, instants, to_si
+from instrument.units import Complex, Direction, Float, direction, icrs_of, instants, to_si
 
 State = Literal["absolute", "differential"]
 
@@ -97,7 +97,7 @@ class Instrument(Component):
         if not isinstance(directions, SkyCoord):
             raise InputError(f"directions must be a SkyCoord, got {type(directions).__name__}")
         when = instants(times)
-        icrs = directions.icrs
+        icrs = icrs_of(directions)
         ra, dec = np.atleast_1d(icrs.ra.rad).ravel(), np.atleast_1d(icrs.dec.rad).ravel()
         if not (np.all(np.isfinite(ra)) and np.all(np.isfinite(dec))):
             raise InputError("directions are not finite")

@@ -20,7 +20,13 @@ NODES, WEIGHTS = np.polynomial.laguerre.laggauss(3)  # rings of a two-dimensiona
 
 def not_modelled(problem: Problem, scale_jy: float) -> list[Item]:
     """Every such item; those whose `bound` is not 0 are part of the bound of a plan, relative to `scale_jy`."""
-    return [*_smearing(problem), *_extended(problem, scale_jy), *_no_horizon(problem)]
+    return [*_smearing(problem), *_extended(problem, scale_jy), *_no_horizon(problem), *_doubts(problem)]
+
+
+def _doubts(problem: Problem) -> list[Item]:
+    """What spectra make of the sources at these frequencies, and what of their file was not read."""
+    sky = problem.sky.sources()
+    return [] if sky is None else [Item(name, text) for name, text in sky.doubts(problem.at.freq_hz).items()]
 
 
 def _smearing(problem: Problem) -> list[Item]:

@@ -253,12 +253,27 @@ def direction(value: object, name: str = "the direction") -> Direction:
     except ValueError as error:
         raise InputError(f"{name} = '{value}' is not a direction; write it like '08h13m36.0s +48d13m03s'") from error
     if not isinstance(coord, SkyCoord) or coord.size != 1:
-        raise InputError(f"{name} = {value!r} is not one direction; give a SkyCoord or '08h13m36.0s +48d13m03s'")
-    icrs = coord.icrs
+        raise InputError(f"{name} = {brief(value)} is not one direction; give a SkyCoord or '08h13m36.0s +48d13m03s'")
+    icrs = icrs_of(coord, name)
     found = Direction(float(np.squeeze(icrs.ra.rad)), float(np.squeeze(icrs.dec.rad)))
     if not np.all(np.isfinite(found)):
         raise InputError(f"{name} is not finite")
     return found
+
+
+def icrs_of(coord: Any, name: str = "directions") -> Any:
+    """Directions of a SkyCoord in ICRS; raises `InputError` for a frame that cannot be turned into it."""
+    from astropy.coordinates import SkyCoord
+
+    if not isinstance(coord, SkyCoord):
+        raise InputError(f"{name} = {brief(coord)} must be a SkyCoord in ICRS")
+    try:
+        return coord.icrs
+    except Exception as error:  # a frame without its time or place fails in astropy's own ways, AttributeError too
+        raise InputError(
+            f"{name} in the frame {coord.frame.name} cannot be turned into ICRS ({type(error).__name__}): give ICRS, "
+            "or the frame with what it needs, such as AltAz(obstime=..., location=...)"
+        ) from None
 
 
 def _write_direction(value: Direction | None) -> str | None:

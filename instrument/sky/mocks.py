@@ -166,6 +166,8 @@ class FaradaySky(GeneratedSky):
             )
         if not (np.isfinite(self.depths).all() and self.depths[0] <= self.depths[1]):
             raise InputError(f"depths = {self.depths}: give the least and the most, in rad/m2")
+        if self.flux < 0:
+            warn(f"flux = {self.flux:g} Jy: a negative flux is taken as it stands")
         return self
 
     def place(self, centre: Direction) -> PointSky:

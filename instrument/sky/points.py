@@ -11,6 +11,7 @@ from pydantic import model_validator
 
 from instrument.errors import InputError
 from instrument.jones.mueller import brightness
+from instrument.numbers import Whole
 from instrument.observe.directions import LIGHT, separation, tangents
 from instrument.observe.sampling import Sampling
 from instrument.sky.base import Sky
@@ -140,9 +141,9 @@ class PointSky(Sky):
         cls, directions: Any, stokes_jy: Any, frequency: Any = None, names: Sequence[str] | None = None, **fields: Any
     ) -> PointSky:
         """Sources at a SkyCoord (S,) with Stokes parameters (S, 4), or Stokes I alone (S,); plain numbers are Jy."""
-        from instrument.units import to_si
+        from instrument.units import icrs_of, to_si
 
-        icrs = directions.icrs
+        icrs = icrs_of(directions)
         ra, dec = np.atleast_1d(icrs.ra.rad).ravel(), np.atleast_1d(icrs.dec.rad).ravel()
         given_unit = hasattr(stokes_jy, "unit")
         flux = np.asarray(to_si(stokes_jy, "Jy", "stokes_jy") if given_unit else stokes_jy, float)
@@ -179,6 +180,7 @@ class PointSky(Sky):
 
     def brightest(self, count: int) -> PointSky:
         """The `count` sources of largest |I| + P, in their own order."""
+        count = Whole().check(count, "brightest")
         if count < 1:
             raise InputError(f"brightest = {count} sources: at least one is needed")
         return self.select(np.sort(np.argsort(-self.power_jy, kind="stable")[:count]))
@@ -235,6 +237,15 @@ class PointSky(Sky):
             linear = (out[..., 1] + 1j * out[..., 2]) * np.exp(1j * turn)
             out[..., 1], out[..., 2] = linear.real, linear.imag
         return out
+
+    def doubts(self, freq_hz: Float) -> dict[str, str]:
+        """What its spectra make of it at some frequencies, and what was not read of its file; for the plan.
+
+        Raises `InputError` where a flux is not finite.
+        """
+        from instrument.sky.doubts import doubts
+
+        return doubts(self, np.atleast_1d(freq_hz))
 
     def _spectrum(self, ratio: Float) -> tuple[Float, Float]:
         """Factor and summand of Stokes I, (F, S), of its logarithmic and linear spectral terms."""

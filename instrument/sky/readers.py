@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
 from instrument.component import Component
 from instrument.errors import FileError, InputError, did_you_mean
 from instrument.files_in import GZIP, harmless, read_regular
+from instrument.numbers import Count
 from instrument.sky.bbs import read_bbs
 from instrument.sky.bbs_text import broken, is_bbs
 from instrument.sky.binary_tables import fits_table, votable
@@ -135,7 +136,7 @@ class Catalogue(GeneratedSky):
     """
 
     path: str
-    brightest: int | None = Field(default=None, ge=1)
+    brightest: Count | None = None
     model: str | None = None
     match: Radians = float(np.deg2rad(30 / 3600))  # 30 arcsec, well below the beam of the surveys of the field
     sizes: Sizes | None = None
