@@ -14,7 +14,7 @@ from instrument.analyze.leakage import expected_percent
 from instrument.analyze.photometry import SourceFluxes
 from instrument.analyze.spectra import Spectrum2D
 from instrument.calibration_run import IMAGES, CalibrationStage
-from instrument.errors import InputError
+from instrument.errors import InputError, unused_ledger
 from instrument.observe.sampling import Sampling
 from instrument.plan import Plan
 from instrument.report.progress import progress_bar
@@ -43,29 +43,33 @@ def run(
     scene or the folder will not do.
     """
     folder = RunFolder(scene_file.name, out)
-    begin = time.perf_counter()
-    scene = scene_file.scene()
-    solved = scene_file.calibrator() is not None
-    scene_file.laboratory()  # wrong settings are refused before anything is computed
-    # a run that calibrates predicts the perfect instrument: its errors are put in block by block, and are the truth
-    perfect = scene.with_fields(instrument=scene.instrument.with_fields(gain=None, feed=None)) if solved else scene
-    plan = scene_file.plan(perfect, memory, workers)
-    if verify:
-        plan = plan.watched(
-            samples=64, seed=scene_file.seed
-        )  # the blocks as the stages get them, before any corruption
-    result = Result(scene_file, scene.instrument, plan, folder.path, seconds={"plan": time.perf_counter() - begin})
-    show(str(plan))
-    with folder:
-        _compute(result)
-        if verify:
-            result.check = plan.check
-            _book(result)
-        with result.timed("write"):
-            _write(result, tables, folder.partial)
-        result.folder = folder.finish()
+    with unused_ledger() as ledger:
+        result = _planned(scene_file, folder.path, memory, workers, verify)
+        result.unused = ledger
+        show(str(result.plan))
+        with folder:
+            _compute(result)
+            if verify:
+                result.check = result.plan.check
+                _book(result)
+            with result.timed("write"):
+                _write(result, tables, folder.partial)
+            result.folder = folder.finish()
     show(summary(result))
     return result
+
+
+def _planned(scene_file: SceneFile, path: Path, memory: str | None, workers: int | None, verify: bool) -> Result:
+    """What will be filled: the scene and its plan."""
+    begin = time.perf_counter()
+    scene = scene_file.scene()
+    # a run that calibrates predicts the perfect instrument: its errors are put in block by block, and are the truth
+    solved = scene_file.calibrator() is not None
+    perfect = scene.with_fields(instrument=scene.instrument.with_fields(gain=None, feed=None)) if solved else scene
+    plan = scene_file.plan(perfect, memory, workers)
+    if verify:  # the blocks as the stages get them, before any corruption
+        plan = plan.watched(samples=64, seed=scene_file.seed)
+    return Result(scene_file, scene.instrument, plan, path, seconds={"plan": time.perf_counter() - begin})
 
 
 def _book(result: Result) -> None:

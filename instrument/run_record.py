@@ -48,6 +48,7 @@ class Result:
     check: Check | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    unused: dict[str, list[str]] = field(default_factory=dict)  # what was given and not used, by where it was given
 
     @property
     def passed(self) -> bool:
@@ -88,6 +89,7 @@ def record(result: Result, tables: dict[str, Any]) -> dict[str, Any]:
             "left_out": [i._asdict() for i in plan.left_out],
             "not_modelled": [i._asdict() for i in plan.not_modelled],
         },
+        "unused": result.unused,
         "seconds": {k: round(v, 3) for k, v in result.seconds.items()},
         "checks": {},
         "stage_errors": _stage_errors(result),

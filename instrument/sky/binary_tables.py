@@ -162,7 +162,7 @@ def _look_through(path: Path, raw: bytes) -> None:
     parser.StartElementHandler, parser.EntityDeclHandler = start, entity
     try:
         parser.Parse(raw, True)
-    except expat.ExpatError as error:
+    except (expat.ExpatError, LookupError) as error:  # an encoding that is none
         raise broken(path, None, f"not a votable table that astropy reads: {first_line(error)}") from None
     if systems and all("FK4" in s or "1950" in s for s in systems):
         raise broken(path, None, "positions are of FK4 (B1950); convert them to J2000 first")

@@ -174,3 +174,13 @@ def test_g2_one_door_for_what_has_settings(planned):
     assert planned("instrument.element={kind='dipole',height='0.5 m'}")[0] == 0
     status, _, said = planned("instrument.element='dipole'")
     assert status == 2 and "height" in said and "{ kind" in said
+
+
+def test_unused_what_was_not_used_stands_in_run_json(tmp_path, monkeypatch, capsys):
+    import json
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "s.toml").write_text(TINY.partition("[noise]")[0])
+    words = ["--no-verify", "--out", "o", "--set", "instrument.beam='none'", "--set", "correct={}"]
+    assert main(["run", "s.toml", *words]) == 0
+    assert json.loads((tmp_path / "o" / "run.json").read_text())["unused"] == {"scene": ["[correct]"]}

@@ -4,19 +4,9 @@ The default run takes a small sample; `long` some hundreds; `--fuzz 3000` thousa
 """
 
 import pytest
-from fuzzing import seeds
 from fuzzing.choose import cases
-from fuzzing.harness import Zygote
 
-SAMPLE, LONG = 24, 400
-
-
-@pytest.fixture(scope="module")
-def zygote(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("fuzz")
-    (folder / "s.toml").write_text(seeds.SCENE)
-    with Zygote([["run", "s.toml", "--no-verify", "--out", "warm"]], folder) as started:
-        yield started
+SAMPLE, LONG = 18, 400
 
 
 def faults(zygote, count, seed):

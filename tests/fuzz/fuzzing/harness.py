@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -13,8 +14,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 ZYGOTE = Path(__file__).with_name("zygote.py")
-CPU_S, WALL_S, MEMORY = 10, 90, 2e9  # wall time is generous: a busy machine is no hang
-GOOD = ("done", "refused", "unwritable")
+CPU_S, WALL_S, MEMORY, MORE = 10, 90, 2e9, 1.6e9  # wall time is generous: a busy machine is no hang
+GOOD = ("done", "refused", "long")
+ANNOUNCED = re.compile(r"^engine .* about (?:(\d+) s|\d+ min)", re.M)
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,7 @@ class Zygote:
             "cpu_s": CPU_S,
             "wall_s": WALL_S,
             "memory": MEMORY,
+            "more": MORE,
             **case.extra,
         }
         print(json.dumps(asked), file=self._process.stdin, flush=True)
@@ -123,6 +126,9 @@ def _verdict(case: Case, answer: dict, folder: Path, new: tuple[str, ...], chang
     said = answer["said"].strip().splitlines()
     mine = [line for line in said if line.startswith("instrument: ")]
     complaints = [line for line in mine if not line.startswith("instrument: warning: ")]
+    announced = ANNOUNCED.search(answer["shown"])
+    if answer["killed"] == "hang" and announced and int(announced[1] or 60) >= CPU_S / 2:
+        return "long"  # stopped at work whose length the plan had said
     if answer["killed"]:
         return f"FAULT {answer['killed']}"
     if answer["signal"]:
@@ -180,10 +186,10 @@ def snapshot(folder: Path) -> dict[str, tuple[int, int]]:
 
 
 def tally(verdicts: list[Verdict]) -> dict[str, dict[str, int]]:
-    """Counts of each kind of case: cases, done, refused, faults, most CPU seconds, most megabytes."""
+    """Counts of each kind of case: cases, done, long, refused, faults, most CPU milliseconds, most megabytes."""
     table: dict[str, dict[str, int]] = {}
     for found in verdicts:
-        row = table.setdefault(found.case.kind, dict.fromkeys(("cases", "done", "refused", "faults"), 0))
+        row = table.setdefault(found.case.kind, dict.fromkeys(("cases", "done", "long", "refused", "faults"), 0))
         row["cases"] += 1
         row[found.verdict if found.good else "faults"] += 1
         row["most_ms"] = max(row.get("most_ms", 0), round(1e3 * found.cpu_s))

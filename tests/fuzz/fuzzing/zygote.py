@@ -1,7 +1,8 @@
 """A process that has everything loaded and forks a child for every case it reads from its standard input.
 
 One JSON object a line: `argv` (of the command) or `call` (a name in CALLS) with `path`, `cwd`, `out` and `err` (files
-for the streams), `cpu_s`, `wall_s`, `memory`, and where asked `signal` and `after_s`, `file_size`. It answers with
+for the streams), `cpu_s`, `wall_s`, `memory` (most that it holds), `more` (addresses beyond those it has),
+and where asked `signal` and `after_s`, `file_size`. It answers with
 `status`, `signal`, `wall_s`, `cpu_s`, `peak`. Started with the path of a scene that is run once to load what is lazy.
 """
 
@@ -58,6 +59,9 @@ def child(case):
             os.close(opened)
         sys.stdin, sys.stdout, sys.stderr = (os.fdopen(n, m) for n, m in ((0, "r"), (1, "w"), (2, "w")))
         resource.setrlimit(resource.RLIMIT_CPU, (int(case["cpu_s"]), int(case["cpu_s"]) + 2))
+        with open("/proc/self/statm") as text:
+            taken = int(text.read().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (taken + int(case["more"]),) * 2)
         if case.get("file_size") is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (case["file_size"],) * 2)
         status = called(case["call"], case["path"]) if case.get("call") else command(case["argv"])
