@@ -31,6 +31,8 @@ from instrument.conformance_bench import (
 from instrument.errors import InputError, InstrumentError, InstrumentWarning
 from instrument.foreground.base import ForegroundRemover
 from instrument.jones.base import JonesTerm
+from instrument.jones.feed import FeedTerm
+from instrument.jones.gain import GainTerm
 from instrument.model import Instrument
 from instrument.observe.sampling import Sampling
 from instrument.predict.base import Predictor
@@ -118,7 +120,14 @@ def its_layout_and_chain_are_the_same_every_time(instrument: Instrument) -> str:
 
 
 def its_chain_runs_from_sky_to_feed(instrument: Instrument, at: Sampling) -> str:
-    """The left end gives feeds; the right end takes the sky, or feeds along north and east where there is no beam."""
+    """Its gain and feed, where given, are the left end, the rest stays as it is; the right end takes the sky, or feeds
+    along north and east where there is no beam.
+    """
+    rest = instrument.with_fields(gain=None, feed=None).chain().jones(at)
+    gain, feed = GainTerm(values=np.full((1, 1, 1, 2), 2.0)), FeedTerm(values=np.full((1, 1, 1, 2), 0.5))
+    found = instrument.with_fields(gain=gain, feed=feed).chain().jones(at)
+    due = mat2.mul(mat2.mul(gain.jones(at), feed.jones(at)), rest)
+    demand_same(found, due, "a given gain and feed are left out: gain x feed x the rest of the chain")
     terms = instrument.chain().terms
     if not terms:
         return "no term"

@@ -156,11 +156,12 @@ def bench(parts: Sequence[JonesTerm] = (), layout: Layout | None = None) -> Samp
 def hard_places(at: Sampling) -> Sampling:
     """The first time of a sampling, towards zenith, horizon and nadir of two stations and both celestial poles.
 
-    The last station is given the axes of the Earth, so that its zenith and horizon are exact in floating point.
+    The last station stands at the pole with the axes of the Earth, so that its zenith and horizon are exact in
+    floating point.
     """
-    axes = np.array(at.layout.axes)
-    axes[-1] = np.eye(3)
-    layout = at.layout.with_fields(axes=axes)
+    axes, positions = np.array(at.layout.axes), np.array(at.layout.positions_m)
+    axes[-1], positions[-1] = np.eye(3), [0.0, 0.0, 6356752.0]
+    layout = at.layout.with_fields(axes=axes, positions_m=positions)
     places = [[r, p, q, -p, -r, p - 1e-3 * r, r + 1e-9 * p] for p, q, r in (axes[0], axes[-1])]
     seen = np.array(places).reshape(-1, 3)
     seen /= np.linalg.norm(seen, axis=1, keepdims=True)

@@ -46,6 +46,17 @@ class Instrument(Component):
         """Gains and feed errors, for the left end of a chain; the identity where none are given."""
         return self.gain or GainTerm(), self.feed or FeedTerm()
 
+    def checked_chain(self) -> Chain:
+        """`chain()`; raises `InputError` where it leaves out the gains or feeds of this instrument."""
+        chain = self.chain()
+        for name, term in (("gain", self.gain), ("feed", self.feed)):
+            if term is not None and not any(part == term for part in chain.parts):
+                raise InputError(
+                    f"{type(self).__name__}.chain() leaves out the '{name}' that was given: let it begin with "
+                    "*self.receivers()"
+                )
+        return chain
+
     def beam(
         self, directions: Any, times: Any, frequencies: Any, pointing: Any = None, state: State = "absolute"
     ) -> Complex:
@@ -59,8 +70,9 @@ class Instrument(Component):
         if state not in ("absolute", "differential"):
             raise InputError(f"state = '{state}' is not a state of a beam: 'absolute' or 'differential'")
         at = self.sampling(directions, times, frequencies, pointing)
-        warn_outside_band(self.chain(), at.freq_hz)
-        chain, _ = self.chain().simplified(at)
+        whole = self.checked_chain()
+        warn_outside_band(whole, at.freq_hz)
+        chain, _ = whole.simplified(at)
         found = chain.jones(at)
         if state == "differential":
             centre = mat2.inverse(chain.jones(at.at_centre()))
@@ -84,9 +96,12 @@ class Instrument(Component):
         layout = self.layout()
         if isinstance(baseline, str):
             raise InputError(f"baseline = '{baseline}' is one station: give two, ('{baseline}', ...)")
-        a, b = (layout.index(n) for n in baseline or layout.names[:2])
-        pair = self.beam(directions, times, frequencies, pointing, state)[:, :, [a, b]]
-        return mueller(pair[:, :, 0], pair[:, :, 1])
+        pair = layout.names[:2] if baseline is None else tuple(baseline)
+        if len(pair) != 2 or not all(isinstance(n, str) for n in pair):
+            raise InputError(f"baseline = {pair} must be the names of two stations")
+        a, b = (layout.index(n) for n in pair)
+        found = self.beam(directions, times, frequencies, pointing, state)
+        return mueller(found[:, :, a], found[:, :, b])
 
     def sampling(self, directions: Any, times: Any, frequencies: Any, pointing: Any = None) -> Sampling:
         """The `Sampling` of this array at directions (SkyCoord), times (Time) and frequencies (Quantity)."""
@@ -106,7 +121,7 @@ class Instrument(Component):
                 raise InputError(f"{len(ra)} directions need a pointing: give pointing=SkyCoord(...)")
             pointing = Direction(float(ra[0]), float(dec[0]))
         centre = direction(pointing, "pointing")
-        freq = np.atleast_1d(np.asarray(to_si(frequencies, "Hz", "frequencies"), float))
+        freq = np.atleast_1d(np.asarray(to_si(frequencies, "Hz", "frequencies", above=0), float))
         return Sampling.build(self.layout(), when, freq, ra, dec, centre)
 
 

@@ -16,7 +16,7 @@ from instrument.predict.base import Predictor, Problem, Work
 from instrument.predict.direct import Direct
 from instrument.predict.threads import look_again, predict
 from instrument.units import si_prefix
-from instrument.visibilities import Visibilities
+from instrument.visibilities import BeamState, Visibilities
 
 
 class Item(NamedTuple):
@@ -121,7 +121,13 @@ class Plan:
             antenna2=self.problem.antenna2,
             interval_s=self.problem.interval_s,
             width_hz=self.problem.width_hz,
+            beam_state=self._state,
         )
+
+    @property
+    def _state(self) -> BeamState:
+        """What is known of the data: the beams of the scene as it was given, not as it was simplified."""
+        return BeamState(beams=self.full.chain.beams())
 
     def blocks(
         self, executor: Executor | None = None, progress: Callable[[float], None] | None = None
@@ -141,7 +147,7 @@ class Plan:
     ) -> Iterator[Visibilities]:
         look_again()
         waiting: deque[Future[Visibilities]] = deque()
-        todo = self.slices
+        todo, state = self.slices, self._state
         done = 0
         try:
             while todo or waiting:
@@ -153,7 +159,7 @@ class Plan:
                     self.checker.see(block, self.full)
                 if progress is not None:
                     progress(done / len(self.slices))
-                yield block
+                yield replace(block, beam_state=state)
         finally:
             for future in waiting:
                 future.cancel()

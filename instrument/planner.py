@@ -44,7 +44,7 @@ def make_plan(
     tolerance = TOLERANCE.check(tolerance, "tolerance")
     workers = (os.cpu_count() or 1) if workers is None else COUNT.check(workers, "workers")
     uv_range = None if uv_range is None else UV_RANGE.check(uv_range, "uv_range")
-    layout, chain = instrument.layout(), instrument.chain()
+    layout, chain = instrument.layout(), instrument.checked_chain()
     sky = sky.about(observation.phase_centre)
     warn_outside_band(chain, observation.freq_hz)
     ra, dec = sky.directions()

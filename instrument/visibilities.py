@@ -9,27 +9,56 @@ from typing import Any, Literal
 import numpy as np
 
 from instrument import mat2
-from instrument.errors import BeamStateError, InputError
+from instrument.errors import BeamStateError, InputError, warn
 from instrument.jones import mueller
 from instrument.jones.base import JonesTerm
 from instrument.jones.chain import Chain
 from instrument.jones.gain import exact_key, slot_normals
-from instrument.jones.towards import Towards
+from instrument.jones.towards import Towards, towards_in
 from instrument.model import Instrument
 from instrument.observe.layout import Layout
 from instrument.observe.sampling import Sampling
-from instrument.units import Bool, Complex, Direction, Float, Int, to_si
+from instrument.units import POSITIVE, SEED, Bool, Complex, Direction, Float, Int, one_si, plain
 
 
 @dataclass(frozen=True)
 class BeamState:
-    """What has been taken out of visibilities: "nothing" or "centre" (the beam), and towards where."""
+    """What has been taken out of visibilities: "nothing" or "centre" (the beam), and towards where.
+
+    `beams` is the part of the chain in the data that differs between directions; `None` where nobody knows it (data
+    from elsewhere). `other` says that it was another beam that has been taken out.
+    """
 
     removed: Literal["nothing", "centre"] = "nothing"
     towards: Direction | None = None
+    beams: Chain | None = field(default=None, compare=False)
+    other: bool = False
 
     def __str__(self) -> str:
-        return "absolute beam" if self.removed == "nothing" else f"differential beam, removed towards {self.towards}"
+        if self.removed == "centre":
+            which = "another beam" if self.other else "differential beam"
+            return f"{which}, removed towards {self.towards}"
+        return "no beam" if self.beams is not None and not self.beams.terms else "absolute beam"
+
+    def without(self, beam: Towards, centre: Direction) -> BeamState:
+        """The state after a beam is taken out; raises `BeamStateError` where it cannot be in the data (any more)."""
+        if self.removed != "nothing":
+            raise BeamStateError(f"a beam has been taken out already ({self}): start from uncorrected visibilities")
+        taken = beam.chain.beams()
+        if self.beams is not None and taken.terms and not self.beams.terms:
+            raise BeamStateError("there is no beam in these visibilities (beam=None): there is none to take out")
+        other = self.beams is not None and taken != self.beams
+        if other:
+            warn("the beam that is taken out is not the beam that is in the data: their ratio is left at the centre")
+        return BeamState("centre", beam.direction or centre, self.beams, other)
+
+    def with_beam(self, beam: Towards) -> BeamState:
+        """The state after the beam at one direction is put on; raises `BeamStateError` where one is there."""
+        if self.removed == "centre":
+            return BeamState(beams=self.beams)
+        if self.beams is not None and self.beams.terms and beam.chain.beams().terms:
+            raise BeamStateError("a beam is in the data already: it would be there twice")
+        return BeamState(beams=beam.chain.beams())
 
 
 def _ones() -> Float:
@@ -44,8 +73,8 @@ def _no_flags() -> Bool:
 class Visibilities:
     """Visibilities in Jy, complex (T, F, B, 2, 2): rows are receptors p, q of the first station, columns of the second.
 
-    `at` holds times, channels, stations and the phase centre; `weight` and `flag` are (T, F, B), length 1 where
-    constant. Nothing is changed in place: every method returns a new object.
+    `at` holds times, channels, stations and the phase centre; `weight` (finite, not negative) and `flag` (bool) are
+    (T, F, B), length 1 where constant. Nothing is changed in place: every method returns a new object.
     """
 
     data: Complex
@@ -63,10 +92,21 @@ class Visibilities:
         want = (times, channels, len(self.antenna1), 2, 2)
         if self.data.shape != want:
             raise InputError(f"data has shape {self.data.shape}, the coordinates need {want}")
+        POSITIVE.check(self.interval_s, "interval_s")
+        if self.width_hz is not None:
+            POSITIVE.check(self.width_hz, "width_hz")
+        for name in ("antenna1", "antenna2"):
+            stations = getattr(self, name)
+            if stations.dtype.kind not in "iu" or np.any((stations < 0) | (stations >= len(self.layout))):
+                raise InputError(f"{name} must hold numbers of stations, 0 to {len(self.layout) - 1}")
         for name in ("weight", "flag"):
             shape = getattr(self, name).shape
             if len(shape) != 3 or any(n not in (1, m) for n, m in zip(shape, want, strict=False)):
                 raise InputError(f"{name} has shape {shape}, needed {want[:3]} with length 1 where constant")
+        if self.flag.dtype.kind != "b":
+            raise InputError(f"flag holds {self.flag.dtype}, needed bool")
+        if self.weight.dtype.kind not in "fiu" or not np.all(np.isfinite(self.weight)) or np.any(self.weight < 0):
+            raise InputError("weight must be finite and not negative: flag what does not count")
 
     def __repr__(self) -> str:
         times, channels, baselines = self.data.shape[:3]
@@ -121,10 +161,7 @@ class Visibilities:
 
     def weighted(self, weight: Float) -> Visibilities:
         """The same with other weights (T, F, B), length 1 where constant; negative and non-finite ones raise."""
-        weight = np.asarray(weight, float)
-        if not np.all(np.isfinite(weight)) or np.any(weight < 0):
-            raise InputError("weights must be finite and not negative")
-        return replace(self, weight=weight)
+        return replace(self, weight=plain(weight, float, "weight"))
 
     def stokes(self) -> Complex:
         """Stokes visibilities I, Q, U, V in Jy, complex (T, F, B, 4): I = (pp+qq)/2 and so on."""
@@ -132,19 +169,20 @@ class Visibilities:
 
     def noise_jy(self, sefd: Any) -> float:
         """Rms of the noise in the real or imaginary part of one correlation: SEFD / sqrt(2 dnu dt), in Jy."""
+        value = one_si(sefd, "Jy", "sefd", at_least=0)
         if self.width_hz is None:
-            raise InputError("noise needs the width of a channel: give channel_width to the Observation")
-        value = float(to_si(sefd, "Jy", "sefd"))
-        if not (np.isfinite(value) and value >= 0):
-            raise InputError(f"sefd = {value} Jy must be finite and not negative")
-        return value / np.sqrt(2 * self.width_hz * self.interval_s)
+            raise InputError(
+                "noise needs the width of a channel, which one channel and channels apart do not tell: give "
+                "channel_width to the Observation"
+            )
+        return value / float(np.sqrt(2 * self.width_hz * self.interval_s))
 
     def with_noise(self, sefd: Any, seed: int) -> Visibilities:
         """The same with thermal noise of stations of one system equivalent flux density added.
 
         The noise of an integration and channel depends on seed, time and frequency only, not on the blocks of a run.
         """
-        sigma = self.noise_jy(sefd)
+        seed, sigma = SEED.check(seed, "seed"), self.noise_jy(sefd)
         noisy = np.array(self.data)
         count = len(self.antenna1)
         for i, freq in enumerate(self.freq_hz):
@@ -161,28 +199,32 @@ class Visibilities:
         data = mat2.sandwich(inverse[:, :, self._pick(inverse, 1)], self.data, inverse[:, :, self._pick(inverse, 2)])
         flag = self.flag | ~(good[:, :, self._pick(inverse, 1)] & good[:, :, self._pick(inverse, 2)])
         state = self.beam_state
-        beams = [t for t in (term.parts if isinstance(term, Chain) else (term,)) if isinstance(t, Towards)]
-        if beams:
-            if state.removed != "nothing":
-                raise BeamStateError(
-                    f"a beam has been taken out already ({state}): start from uncorrected visibilities"
-                )
-            state = BeamState("centre", beams[0].direction or self.phase_centre)
+        for beam in towards_in(term):
+            state = state.without(beam, self.phase_centre)
         return replace(self, data=data, flag=flag, beam_state=state)
 
     def without_beam(self, instrument: Instrument) -> Visibilities:
-        """The same with the beam of an instrument towards the phase centre taken out, not its gains and feeds."""
+        """The same with the beam of an instrument towards the phase centre taken out, not its gains and feeds.
+
+        Raises `BeamStateError` where another beam, or none, is in the data.
+        """
         if instrument.layout().names != self.layout.names:
             raise InputError("these visibilities are of other stations than the instrument, or in another order")
-        return self.corrected(Towards(chain=instrument.chain().beams()))
+        beams, there = instrument.chain().beams(), self.beam_state.beams
+        if there is not None and there.terms and self.beam_state.removed == "nothing" and there != beams:
+            raise BeamStateError(
+                "the beam of this instrument is not the beam in the data; to take it out on purpose: "
+                "corrected(Towards(chain=...))"
+            )
+        return self.corrected(Towards(chain=beams))
 
     def corrupted(self, term: JonesTerm | Chain) -> Visibilities:
         """J_a V J_b^H for a direction-independent term; inverse of `corrected`."""
         jones = self._station_jones(term)
         data = mat2.sandwich(jones[:, :, self._pick(jones, 1)], self.data, jones[:, :, self._pick(jones, 2)])
         state = self.beam_state
-        if any(isinstance(t, Towards) for t in (term.parts if isinstance(term, Chain) else (term,))):
-            state = BeamState()
+        for beam in towards_in(term):
+            state = state.with_beam(beam)
         return replace(self, data=data, beam_state=state)
 
     def __sub__(self, other: Visibilities) -> Visibilities:

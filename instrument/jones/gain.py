@@ -6,15 +6,14 @@ import zlib
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
 from instrument import mat2
 from instrument.errors import InputError
 from instrument.jones.base import Basis, JonesTerm, Simplified, Structure
 from instrument.jones.lookup import demand_within, nearest
-from instrument.numbers import Real
 from instrument.observe.sampling import Sampling
-from instrument.units import ArrayOf, Complex, Float
+from instrument.units import ArrayOf, Complex, Float, Real, Seed
 
 Table = Annotated[Any, ArrayOf(complex, (None, None, None, 2))]
 Axis = Annotated[Any, ArrayOf(float, (None,))]
@@ -36,8 +35,8 @@ class StationTable(JonesTerm):
     values: Table | None = None
     slots_s: Axis | None = None
     freq_hz: Axis | None = None
-    rms: Annotated[float, Real(at_least=0, at_most=1e6)] = 0.0
-    seed: Annotated[int, Field(ge=0)] = 0
+    rms: Annotated[float, Real(at_least=0, at_most=1e6)] = 0.0  # squares of squares stay in range
+    seed: Seed = 0
 
     @model_validator(mode="after")
     def _axes_fit(self) -> Self:

@@ -15,7 +15,7 @@ from instrument.jones.base import Basis, ElementBeam, JonesTerm, PerStation, Sca
 from instrument.observe.directions import LIGHT
 from instrument.observe.sampling import Sampling
 from instrument.phasor import array_factor
-from instrument.units import ArrayOf, Complex, Float, Hertz, Int, SkyDirection
+from instrument.units import ArrayOf, Complex, Float, Int, PositiveHertz, SkyDirection
 
 Offsets = Annotated[Any, ArrayOf(float, (None, None, 3))]
 
@@ -54,7 +54,7 @@ class ArrayFactor(ScalarTerm):
 
     maps: ClassVar[tuple[Basis, Basis]] = ("feed", "feed")
     levels: tuple[Level, ...]
-    reference_frequency: Hertz | None = None
+    reference_frequency: PositiveHertz | None = None
 
     def scalar(self, at: Sampling) -> Complex:
         """The array factor (T, F, A, S)."""
@@ -105,7 +105,7 @@ class StationBeam(JonesTerm):
 
     element: ElementBeam
     levels: tuple[Level, ...]
-    reference_frequency: Hertz | None = None
+    reference_frequency: PositiveHertz | None = None
 
     @cached_property
     def array(self) -> ArrayFactor:

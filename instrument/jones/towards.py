@@ -1,11 +1,16 @@
-"""Towards: a chain evaluated in one direction, the term with which a beam is taken out of data at the phase centre."""
+"""Towards: a chain evaluated in one direction, the term with which a beam is taken out of data at the phase centre.
+
+`towards_in` finds it in whatever holds it.
+"""
 
 from __future__ import annotations
 
-from typing import ClassVar
+from collections.abc import Iterator, Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 
+from instrument.component import Component
 from instrument.jones.base import Basis, JonesTerm
 from instrument.jones.chain import Chain
 from instrument.observe.sampling import Sampling
@@ -24,3 +29,17 @@ class Towards(JonesTerm):
         """J(direction) of every station, (T, F, A, 1, 2, 2)."""
         d = self.direction or at.centre
         return self.chain.jones(at.towards(np.array([d.ra_rad]), np.array([d.dec_rad])))
+
+
+def towards_in(thing: Any) -> Iterator[Towards]:
+    """Every beam at one direction that a term or chain holds: itself, its parts, or a field of a composite."""
+    if isinstance(thing, Towards):
+        yield thing
+    elif isinstance(thing, Component):
+        for name in type(thing).model_fields:
+            yield from towards_in(getattr(thing, name))
+    elif isinstance(thing, tuple | list):
+        for item in thing:
+            yield from towards_in(item)
+    elif isinstance(thing, Mapping):
+        yield from towards_in(tuple(thing.values()))

@@ -11,10 +11,14 @@ from pydantic import model_validator
 
 from instrument.component import Component
 from instrument.errors import InputError, did_you_mean
-from instrument.units import ArrayOf, Float, Int, plain, to_si
+from instrument.units import ArrayOf, Float, Int, one_si, plain, to_si
 
 Positions = Annotated[Any, ArrayOf(float, (None, 3))]
 Axes = Annotated[Any, ArrayOf(float, (None, 3, 3))]
+
+# The surface of the Earth lies 6.353e6 (the poles) to 6.385e6 m (Chimborazo) from its centre; with some room
+GROUND_M = 6.34e6, 6.40e6
+UPRIGHT_RAD = np.deg2rad(10.0)
 
 
 class Layout(Component):
@@ -47,12 +51,36 @@ class Layout(Component):
         skew = np.abs(self.axes @ np.swapaxes(self.axes, 1, 2) - np.eye(3)).max()
         if skew > 1e-6:
             raise InputError(f"axes of stations are not orthonormal (off by {skew:.1e})")
+        self._standing()
         return self
+
+    def _standing(self) -> None:
+        """Raise `InputError` for stations in the middle of the Earth, and for axes that no antenna plane has."""
+        _demand_distance(self.names, self.positions_m, (1e6, np.inf))
+        left = np.flatnonzero(np.linalg.det(self.axes) < 0)
+        if left.size:
+            raise InputError(
+                f"the axes of station '{self.names[left[0]]}' are left-handed: rows are p (about east), q (about "
+                "north), r (up), in this order"
+            )
+        up = geodetic_axes(self.positions_m)[:, 2]
+        tilt = np.arccos(np.clip(np.einsum("ac,ac->a", self.axes[:, 2], up), -1, 1))
+        # the plane of an array is that of its middle, from which its ends lean away as the Earth is round
+        steep = np.flatnonzero(tilt > UPRIGHT_RAD + self.longest_m / GROUND_M[0])
+        if steep.size:
+            a = steep[0]
+            raise InputError(
+                f"the third axis of station '{self.names[a]}' is {np.rad2deg(tilt[a]):.3g} deg from the vertical: rows "
+                "are p (about east), q (about north), r (up), in this order"
+            )
 
     @classmethod
     def geodetic(cls, names: Sequence[str], positions_m: Float) -> Layout:
-        """Layout whose axes are local east, north and up of the WGS84 ellipsoid."""
-        positions_m = plain(positions_m, float, "positions_m")
+        """Layout whose axes are local east, north and up of the WGS84 ellipsoid; positions ITRF, m, on the ground."""
+        positions_m = plain(positions_m, float, "positions_m", finite=True)
+        if positions_m.ndim != 2 or positions_m.shape[1] != 3:
+            raise InputError(f"positions_m has shape {positions_m.shape}, needed (any, 3)")
+        _demand_distance(tuple(names), positions_m, GROUND_M)
         return cls(names=tuple(names), positions_m=positions_m, axes=geodetic_axes(positions_m))
 
     @classmethod
@@ -60,10 +88,23 @@ class Layout(Component):
         """Layout of stations east, north and up (A, 3) of a WGS84 reference point, all with its axes; with units."""
         import erfa
 
-        place = (to_si(longitude, "rad", "longitude"), to_si(latitude, "rad", "latitude"), to_si(height, "m", "height"))
+        place = tuple(
+            one_si(x, unit, name)
+            for x, unit, name in (
+                (longitude, "rad", "longitude"),
+                (latitude, "rad", "latitude"),
+                (height, "m", "height"),
+            )
+        )
+        if abs(place[1]) > np.pi / 2:
+            raise InputError(f"latitude = {np.rad2deg(place[1]):g} deg must lie between -90 and 90 deg")
+        if not -12e3 < place[2] < 30e3:
+            raise InputError(f"height = {place[2]:g} m is not on the Earth: that of the site above the WGS84 ellipsoid")
         reference = np.asarray(erfa.gd2gc(1, *place))
         axes = geodetic_axes(reference[None])
         enu_m = np.asarray(to_si(enu, "m", "enu"), float)
+        if enu_m.ndim != 2 or enu_m.shape[1] != 3:
+            raise InputError(f"enu has shape {enu_m.shape}, needed (any, 3)")
         return cls(
             names=tuple(names), positions_m=reference + enu_m @ axes[0], axes=np.repeat(axes, len(enu_m), axis=0)
         )
@@ -111,6 +152,19 @@ class Layout(Component):
         """Longest baseline, m."""
         a, b = self.baselines
         return float(np.linalg.norm(self.positions_m[a] - self.positions_m[b], axis=1).max())
+
+
+def _demand_distance(names: Sequence[str], positions_m: Float, limits: tuple[float, float]) -> None:
+    """Raise `InputError` for a station that is not at these distances from the centre of the Earth, m."""
+    far = np.linalg.norm(positions_m, axis=1)
+    wrong = np.flatnonzero((far < limits[0]) | (far > limits[1]))
+    if wrong.size:
+        k = int(wrong[0])
+        name = names[k] if k < len(names) else k
+        raise InputError(
+            f"station '{name}' is {far[k]:.7g} m from the centre of the Earth, whose surface is {GROUND_M[0]:g} to "
+            f"{GROUND_M[1]:g} m from it: positions are ITRF in m; for offsets about a site use Layout.from_enu"
+        )
 
 
 def geodetic_axes(positions_m: Float) -> Float:

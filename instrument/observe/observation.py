@@ -15,6 +15,7 @@ from instrument.observe.layout import Layout
 from instrument.units import Float, Hertz, HertzArray, Instant, Seconds, SkyDirection
 
 MOST_TIMES = 3_000_000  # integrations that are planned at once, at 20 us and 1 kB each
+SHORTEST_S = 1e-5  # MJD seconds of today resolve 1e-6 in double precision
 
 
 class Observation(Component):
@@ -22,7 +23,7 @@ class Observation(Component):
 
     Give `start` (UTC, the beginning of the first integration) or `transit` (a UTC day, "2012-12-07": the observation is
     centred on the culmination of the phase centre within that day). `channel_width` is that of one channel; where it is
-    not given, it is the spacing of the channels.
+    not given, it is the spacing of the channels where they are adjacent. `duration` is a whole number of intervals.
     """
 
     phase_centre: SkyDirection
@@ -39,8 +40,19 @@ class Observation(Component):
             raise InputError("an observation needs 'start' or 'transit', and not both")
         if self.interval <= 0:
             raise InputError(f"interval = {self.interval:g} s must be positive")
+        if self.interval < SHORTEST_S:
+            raise InputError(
+                f"interval = {self.interval:g} s is shorter than {SHORTEST_S:g} s: times are kept to 1 microsecond"
+            )
         if self.duration < self.interval:
             raise InputError(f"duration = {self.duration:g} s is shorter than one interval of {self.interval:g} s")
+        count = self.duration / self.interval
+        if abs(count - round(count)) > 1e-3:
+            few, more = (n * self.interval for n in (np.floor(count), np.ceil(count)))
+            raise InputError(
+                f"duration = {self.duration:g} s is {count:.6g} intervals of {self.interval:g} s: give {few:.10g} s or "
+                f"{more:.10g} s"
+            )
         if self.frequencies.size == 0 or np.any(self.frequencies <= 0):
             raise InputError("frequencies must be positive, and at least one")
         if np.unique(self.frequencies).size != self.frequencies.size:
@@ -56,10 +68,17 @@ class Observation(Component):
 
     @property
     def width_hz(self) -> float | None:
-        """Width of a channel: given, or the smallest spacing of channels; `None` for one channel without a width."""
+        """Width of a channel: given, or the smallest spacing of channels; `None` where neither is known.
+
+        A spacing above 5 % of the lowest frequency is none of adjacent channels: 120 and 180 MHz are not 60 MHz wide.
+        """
         if self.channel_width is not None:
             return self.channel_width
-        return float(np.diff(np.sort(self.frequencies)).min()) if self.frequencies.size > 1 else None
+        if self.frequencies.size < 2:
+            return None
+        known = np.sort(self.frequencies)
+        step = float(np.diff(known).min())
+        return step if step <= 0.05 * known[0] else None
 
     @property
     def freq_hz(self) -> Float:

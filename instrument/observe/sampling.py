@@ -8,9 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from instrument.errors import InputError
 from instrument.observe.directions import EarthFrame, earth_frame, lmn, tangents
 from instrument.observe.layout import Layout
-from instrument.units import Direction, Float, unit_vectors
+from instrument.units import Direction, Float, plain, unit_vectors
 
 
 class Rising(NamedTuple):
@@ -49,14 +50,17 @@ class Sampling:
     def build(
         cls, layout: Layout, times: Any, freq_hz: Float, ra_rad: Float, dec_rad: Float, centre: Direction
     ) -> Sampling:
-        """Sampling at astropy `times` (T,), for ICRS directions (S,) in rad."""
+        """Sampling at astropy `times` (T,), for ICRS directions (S,) in rad; all finite, frequencies positive."""
+        freq_hz = np.atleast_1d(plain(freq_hz, float, "freq_hz", finite=True))
+        if np.any(freq_hz <= 0):
+            raise InputError(f"freq_hz = {freq_hz.min():g} Hz must be positive")
         return cls(
             layout=layout,
             earth=earth_frame(times, layout.centre_m),
             slots_s=mjd_seconds(times),
-            freq_hz=np.atleast_1d(np.asarray(freq_hz, float)),
-            ra_rad=np.atleast_1d(np.asarray(ra_rad, float)),
-            dec_rad=np.atleast_1d(np.asarray(dec_rad, float)),
+            freq_hz=freq_hz,
+            ra_rad=np.atleast_1d(plain(ra_rad, float, "right ascension of directions", finite=True)),
+            dec_rad=np.atleast_1d(plain(dec_rad, float, "declination of directions", finite=True)),
             centre=centre,
         )
 

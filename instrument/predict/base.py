@@ -13,7 +13,7 @@ from instrument.jones.chain import Chain
 from instrument.observe.sampling import Sampling
 from instrument.sky.base import Sky
 from instrument.units import Complex, Int
-from instrument.visibilities import Visibilities
+from instrument.visibilities import BeamState, Visibilities
 
 
 class Work(NamedTuple):
@@ -90,4 +90,5 @@ class Predictor(Component):
             antenna2=problem.antenna2,
             interval_s=problem.interval_s,
             width_hz=problem.width_hz,
+            beam_state=BeamState(beams=problem.chain.beams()),
         )
