@@ -40,10 +40,6 @@ class Observation(Component):
             raise InputError("an observation needs 'start' or 'transit', and not both")
         if self.interval <= 0:
             raise InputError(f"interval = {self.interval:g} s must be positive")
-        if self.interval < SHORTEST_S:
-            raise InputError(
-                f"interval = {self.interval:g} s is shorter than {SHORTEST_S:g} s: times are kept to 1 microsecond"
-            )
         if self.duration < self.interval:
             raise InputError(f"duration = {self.duration:g} s is shorter than one interval of {self.interval:g} s")
         count = self.duration / self.interval
@@ -92,6 +88,10 @@ class Observation(Component):
             raise RefusedError(
                 f"duration = {self.duration:g} s by interval = {self.interval:g} s is {asked:.3g} integrations, and "
                 f"{MOST_TIMES} are planned at once: lengthen the interval, or split the observation"
+            )
+        if self.interval < SHORTEST_S:
+            raise InputError(
+                f"interval = {self.interval:g} s is shorter than {SHORTEST_S:g} s: times are kept to 1 microsecond"
             )
         afford(1e3 * self.count, f"an observation of {self.count} integrations", "lengthen the interval")
         from astropy import units as u

@@ -264,7 +264,7 @@ def test_b4_rounding_does_not_decide_whether_it_is_whole(duration, interval, cou
 
 def test_b4_integrations_are_not_shorter_than_times_resolve():
     with pytest.raises(InputError, match="microsecond"):
-        night(duration=1e-5 * u.s, interval=1e-6 * u.s)
+        night(duration=1e-5 * u.s, interval=1e-6 * u.s).times(Forgetful().layout())
 
 
 # B5: how wide a channel is --------------------------------------------------------------------------------------------
