@@ -16,7 +16,8 @@ from instrument import mat2
 from instrument.analyze.subtraction import ManyDirectionsResult
 from instrument.analyze.sweep import ranks
 from instrument.calibrate.directional import DirectionalCal
-from instrument.calibrate.selfcal import UNKNOWNS, SelfCal
+from instrument.calibrate.gauge import UNKNOWNS
+from instrument.calibrate.selfcal import SelfCal
 from instrument.component import Component
 from instrument.errors import InputError, Outcome, did_you_mean
 from instrument.jones.chain import Chain

@@ -13,7 +13,7 @@ import numpy as np
 
 from instrument.compiled import compiled
 from instrument.phasor import FAST
-from instrument.units import Float, Int
+from instrument.units import Float
 
 LANES = 16
 PATTERNS = {"full": 0, "diagonal": 1, "scalar": 2, "phase": 3}
@@ -81,19 +81,21 @@ def sweep(data: Any, model: Any, a1: Any, a2: Any, jones: Any, right: Any, left:
 
 @compiled(nogil=True, fastmath=FAST, error_model="numpy")
 def residual(data: Any, model: Any, a1: Any, a2: Any, jones: Any, out: Any) -> None:
-    """Power of V - J_a M J_b^H and of V in each lane, (2, L)."""
+    """Power of V - J_a M J_b^H, of V and of J_a M J_b^H on each baseline, (3, B, L)."""
     out[:] = 0.0
     baselines = len(a1)
     for i in range(data.shape[0]):
-        p, q = a1[i % baselines], a2[i % baselines]
+        row = i % baselines
+        p, q = a1[row], a2[row]
         for lane in range(jones.shape[2]):
             v, m = _at(data, i, lane), _at(model, i, lane)
             # (J_p M) J_q^H, as J_p (M^H)^H
             s = _mul_h(_mul_h(_at(jones, p, lane), _herm(m)), _at(jones, q, lane))
             for k in range(8):
                 d = v[k] - s[k]
-                out[0, lane] += d * d
-                out[1, lane] += v[k] * v[k]
+                out[0, row, lane] += d * d
+                out[1, row, lane] += v[k] * v[k]
+                out[2, row, lane] += s[k] * s[k]
 
 
 def planar(values: Any, lanes: int) -> Float:
@@ -135,14 +137,3 @@ def solve_stations(right: Float, left: Float, pattern: str) -> Any:
                 p, q = p / np.abs(p), q / np.abs(q)
             out[..., 0, 0], out[..., 1, 1] = p, q
     return out
-
-
-def stations_of(antenna1: Int, antenna2: Int, weight: Any, stations: int) -> Any:
-    """Which stations (L, A) have any weight in each lane; weight (L, N) over samples of baselines."""
-    count = len(antenna1)
-    per_baseline = weight.reshape(len(weight), -1, count).sum(axis=1)
-    out = np.zeros((len(weight), stations))
-    for ends in (antenna1, antenna2):
-        rows: Any = slice(None)
-        np.add.at(out, (rows, ends), per_baseline)
-    return out > 0

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from instrument import mat2
+from instrument.calibrate.fit import doubts
 from instrument.calibrate.gauge import Gauge
 from instrument.component import Component
 from instrument.errors import InputError, InstrumentError, Outcome
 from instrument.jones.base import JonesTerm
 from instrument.jones.chain import Chain
 from instrument.jones.table import JonesTable
+from instrument.observe.intervals import Intervals
 from instrument.observe.sampling import Sampling
-from instrument.units import Complex, Float, Int
+from instrument.units import Bool, Complex, Float, Int
 from instrument.visibilities import Visibilities
 
 
@@ -28,7 +30,11 @@ class Solution:
 
     `outcome` (t, f) says how each interval ended; intervals and stations without a solution are NaN in `term`, so what
     is corrected with them is flagged. `residual` (t, f) is the rms of V - J_a M J_b^H over the rms of V, weighted.
-    `gauge` says what the model leaves undetermined; `history` is the largest relative step after each iteration.
+    `gauge` says what the model leaves undetermined in every interval, `looser` what it does in those that leave more;
+    `history` is the largest relative step after each iteration. `suspects` (T, F, B) are visibilities that spoilt the
+    fit of an interval: `data.flagged(solution.suspects)`, and solve again; `spoilt` counts them by baseline.
+    `unexplained` (t, f) is the largest of `residual`, the same without the strongest baselines, and that of a typical
+    baseline. `doubts` are sentences about all this, printed with a solution.
     """
 
     term: JonesTable
@@ -38,6 +44,11 @@ class Solution:
     gauge: Gauge
     history: Float
     interval_s: float
+    looser: dict[tuple[int, int], Gauge] = field(default_factory=dict)
+    suspects: Bool = field(default_factory=lambda: np.zeros((1, 1, 1), bool))
+    spoilt: Mapping[str, int] = field(default_factory=dict)
+    unexplained: Float = field(default_factory=lambda: np.zeros((1, 1)))
+    notes: tuple[str, ...] = ()
 
     @property
     def jones(self) -> Complex:
@@ -48,6 +59,11 @@ class Solution:
     def converged(self) -> Any:
         """Which intervals converged, bool (t, f)."""
         return self.outcome == Outcome.CONVERGED
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What to know before the solution is used, in sentences: what it leaves, and what spoilt it."""
+        return (*doubts(self.converged, self.unexplained, self.spoilt), *self.notes)
 
     def check(self) -> None:
         """Raise `InstrumentError` when an interval has not converged, with how many ended how."""
@@ -67,7 +83,10 @@ class Solution:
         to = np.asarray(to)
         if to.shape != self.jones.shape:
             raise InputError(f"the matrices to align to have shape {to.shape}, the solution {self.jones.shape}")
-        turned = mat2.mul(self.jones, self.gauge.nearest(self.jones, to)[:, :, None])
+        turn = self.gauge.nearest(self.jones, to)
+        for where, gauge in self.looser.items():
+            turn[where] = gauge.nearest(self.jones[where], to[where])
+        turned = mat2.mul(self.jones, turn[:, :, None])
         return replace(self, term=self.term.with_fields(values=turned))
 
     @classmethod
@@ -77,22 +96,37 @@ class Solution:
         longest = max(len(p.history) for p in parts)
         history = np.stack([np.pad(p.history, (0, longest - len(p.history))) for p in parts]).max(axis=0)
         values, slots = (np.concatenate([getattr(t, k) for t in tables]) for k in ("values", "slots_s"))
+        gauge = min((p.gauge for p in parts), key=lambda g: g.count)
+        first = np.cumsum([0, *(len(p.outcome) for p in parts)])
         return cls(
             term=tables[0].with_fields(values=values, slots_s=slots),
             outcome=np.concatenate([p.outcome for p in parts]),
             iterations=np.concatenate([p.iterations for p in parts]),
             residual=np.concatenate([p.residual for p in parts]),
-            gauge=parts[0].gauge,
+            gauge=gauge,
             history=history,
             interval_s=parts[0].interval_s,
+            looser={
+                (int(t) + k, f): p.looser.get((k, f), p.gauge)
+                for t, p in zip(first, parts, strict=False)
+                for k, f in (np.ndindex(p.outcome.shape) if p.gauge.count > gauge.count else p.looser)
+            },
+            spoilt=sum((Counter(p.spoilt) for p in parts), Counter()),
+            unexplained=np.concatenate([np.broadcast_to(p.unexplained, p.outcome.shape) for p in parts]),
+            notes=tuple(dict.fromkeys(text for p in parts for text in p.notes)),
         )
 
     def __str__(self) -> str:
         times, channels = self.outcome.shape
         good = int(self.converged.sum())
-        return (
-            f"{good} of {times * channels} intervals converged, {np.median(self.iterations):.0f} iterations (median), "
-            f"residual {np.nanmedian(self.residual):.1e}; {self.gauge}"
+        looser = f" (more in {len(self.looser)} intervals)" if self.looser else ""
+        return "; ".join(
+            (
+                f"{good} of {times * channels} intervals converged, {np.median(self.iterations):.0f} iterations "
+                f"(median), residual {np.nanmedian(self.residual):.1e}",
+                f"{self.gauge}{looser}",
+                *self.doubts,
+            )
         )
 
 
@@ -111,6 +145,29 @@ def pair(data: Visibilities, model: Visibilities) -> tuple[Complex, Complex, Flo
     """
     if data.data.shape != model.data.shape:
         raise InputError(f"data and model do not pair: they have shapes {data.data.shape} and {model.data.shape}")
-    data - replace(model, data=data.data)  # checks coordinates and beam states
+    for count, what in zip(data.data.shape, ("integrations", "channels", "baselines"), strict=False):
+        if count == 0:
+            raise InputError(f"the data have no {what}: there is nothing to solve for")
+    if not np.all(np.isfinite(data.weight)) or np.any(data.weight < 0):
+        bad = data.weight[~(np.isfinite(data.weight) & (data.weight >= 0))]
+        raise InputError(f"weight = {bad[0]} must be finite and not negative: flag what should not count")
+    replace(data, data=model.data) - model  # checks coordinates and beam states
     weight = np.broadcast_to(data.effective_weight, data.data.shape[:3])
     return data.data, model.data, weight
+
+
+def other_length(found: Intervals, asked_s: float | None) -> tuple[str, ...]:
+    """A sentence where intervals are not as long as asked: a whole number of integrations lasts otherwise."""
+    if (
+        asked_s is None
+        or abs(found.length_s - asked_s) <= 1e-6 * asked_s
+        or found.length_s < asked_s - found.length_s / found.step
+    ):
+        return ()
+    return (f"intervals last {found.length_s:.6g} s, not {asked_s:.6g} s: a whole number of integrations",)
+
+
+def by_baseline(suspects: Bool, data: Visibilities) -> dict[str, int]:
+    """How many visibilities (T, F, B) are marked on each baseline that has any, by its name."""
+    names, count = data.layout.names, suspects.sum(axis=(0, 1))
+    return {f"{names[data.antenna1[b]]}-{names[data.antenna2[b]]}": int(count[b]) for b in np.flatnonzero(count)}

@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from instrument.calibrate.gauge import UNKNOWNS
 from instrument.errors import Outcome
 from instrument.units import Bool, Complex, Float, Int
 
-UNKNOWNS = {"full": 8, "diagonal": 4, "scalar": 2, "phase": 2}  # real numbers per station and column
 HELD = 4  # first rounds, in which each station is solved with the others held, and goes half the way
 WAYS = (1.0, 0.3, 0.1, 0.03)  # of a step: a snapshot of five clusters (condition number 1e6) needs short ones at first
 GRADIENTS = 300  # most conjugate gradients of one round

@@ -17,6 +17,7 @@ GENERATORS: dict[str, Complex] = {
     "scalar": np.concatenate([1j * _SIGMA[:1], _SIGMA[:1]]),
     "phase": 1j * _SIGMA[:2],
 }
+UNKNOWNS = {"full": 8, "diagonal": 4, "scalar": 2, "phase": 2}  # real numbers per station
 BLIND = 1e-12  # share of the model's power that a direction may change and still count as unseen
 
 
@@ -92,12 +93,18 @@ def common_form(moment: Complex, generators: Complex) -> Float:
     return np.asarray(np.einsum("ijac,...ca->...ij", products, moment).real)
 
 
+def common(form: Float, power: float, pattern: str) -> Gauge:
+    """The gauge of a `common_form` (n, n) of a model of some power, for station matrices of a pattern."""
+    use = GENERATORS[pattern]
+    values, vectors = np.linalg.eigh(form / (power if power > 0 else 1.0))
+    return Gauge(np.einsum("kn,kij->nij", vectors[:, values <= BLIND], use), values, pattern)
+
+
 def gauge_of(model: Complex, weight: Float, pattern: str = "full") -> Gauge:
     """The gauge of a model (T, F, B, 2, 2) with weights (T, F, B), for station matrices of a pattern."""
-    use = GENERATORS[pattern]
     w = np.where(np.isfinite(model).all(axis=(-2, -1)), weight, 0.0).reshape(-1)
-    m = np.where((w > 0)[:, None, None], model.reshape(-1, 2, 2), 0.0)
-    moment = second_moment(m, w)
-    power = float(np.trace(moment).real)
-    values, vectors = np.linalg.eigh(common_form(moment, use) / (power if power > 0 else 1.0))
-    return Gauge(np.einsum("kn,kij->nij", vectors[:, values <= BLIND], use), values, pattern)
+    m: Complex = np.where((w > 0)[:, None, None], model.reshape(-1, 2, 2), 0.0 + 0j)
+    # near 1: the square of 1e170 Jy is infinite
+    size = max(float(np.abs(m.view(float)).max(initial=0.0)), 1e-300)
+    moment = second_moment(m / size, w / max(float(w.max(initial=0.0)), 1e-300))
+    return common(common_form(moment, GENERATORS[pattern]), float(np.trace(moment).real), pattern)

@@ -7,6 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from instrument.calibrate.als import LANES, matrices, planar, residual, solve_stations, sweep
+from instrument.calibrate.fit import Left
 from instrument.calibrate.gauge import GENERATORS, common_form, second_moment
 from instrument.units import Complex, Float, Int
 
@@ -38,7 +39,11 @@ class Lanes:
         self.lanes = LANES if self.count > LANES // 2 else max(1, self.count)
         self.v, self.m = planar(v, self.lanes), planar(m, self.lanes)
         self.products = (v, m)
-        self.form = common_form(second_moment(m, np.ones(m.shape[:2])), GENERATORS[settings.pattern])
+        moment = second_moment(m, np.ones(m.shape[:2]))
+        self.form, self.model_power = (
+            common_form(moment, GENERATORS[settings.pattern]),
+            np.einsum("lii->l", moment).real,
+        )
         self.total = (np.abs(v) ** 2).sum(axis=(-3, -2, -1))
         power = (np.abs(m) ** 2).sum(axis=(-2, -1)).reshape(self.count, -1, len(a1)).sum(axis=1)
         stations = active.shape[1]
@@ -201,27 +206,34 @@ class Lanes:
             out[:, :, r, r] = vector
         return _unit_diagonal(out) if self.settings.pattern == "phase" else out
 
-    def unexplained(self, jones: Complex) -> Float:
-        """Rms of V - J_a M J_b^H over the rms of V, weighted, in each lane."""
-        out = np.zeros((2, self.lanes))
+    def left(self, jones: Complex, samples: Int) -> Left:
+        """What matrices leave of the data, by baseline; `samples` (L, B) count."""
+        out = np.zeros((3, len(self.a1), self.lanes))
         residual(self.v, self.m, self.a1, self.a2, planar(jones, self.lanes), out)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            return np.sqrt(out[0] / out[1])[: self.count]
+        rest, data, fit = np.moveaxis(out[..., : self.count], 2, 1)
+        return Left(rest, data, fit, samples)
 
 
-def levels(v: Complex, m: Complex, a1: Int, a2: Int, stations: int) -> Float:
-    """Rough amplitude of each station (L, A): least squares of log |V_ab| - log |M_ab| = log s_a + log s_b."""
+def levels(v: Complex, m: Complex, a1: Int, a2: Int, stations: int, robust: bool = False) -> Float:
+    """Rough amplitude of each station (L, A): log |V_ab| - log |M_ab| = log s_a + log s_b by least squares.
+
+    `robust`: by least absolute values, which an outlier does not move.
+    """
     power = [(np.abs(z) ** 2).sum(axis=(-2, -1)).reshape(len(z), -1, len(a1)).sum(axis=1) for z in (v, m)]
     good = (power[0] > 0) & (power[1] > 0)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(good, 0.5 * np.log(power[0] / power[1]), 0.0)
-    normal, right = np.zeros((len(v), stations, stations)), np.zeros((len(v), stations))
-    for one, other in ((a1, a2), (a2, a1)):
-        rows: Any = slice(None)
-        np.add.at(normal, (rows, one, one), good)
-        np.add.at(normal, (rows, one, other), good)
-        np.add.at(right, (rows, one), ratio)
-    found = np.linalg.solve(normal + 1e-9 * np.eye(stations), right[..., None])[..., 0]
+    weight = good.astype(float)
+    for _ in range(30 if robust else 1):
+        normal, right = np.zeros((len(v), stations, stations)), np.zeros((len(v), stations))
+        for one, other in ((a1, a2), (a2, a1)):
+            rows: Any = slice(None)
+            np.add.at(normal, (rows, one, one), weight)
+            np.add.at(normal, (rows, one, other), weight)
+            np.add.at(right, (rows, one), ratio * weight)
+        found = np.linalg.solve(normal + 1e-9 * np.eye(stations), right[..., None])[..., 0]
+        # 0.05: scatter of amplitudes that polarization and directions make
+        weight = good / np.maximum(np.abs(ratio - found[:, a1] - found[:, a2]), 0.05)
     return np.exp(np.clip(found, -40, 40))
 
 

@@ -1,0 +1,184 @@
+"""Some intervals of a self-calibration, solved side by side: what counts, where to start, and how it ended."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from instrument.calibrate.again import Fits
+from instrument.calibrate.fit import strange
+from instrument.calibrate.gauge import UNKNOWNS, Gauge, common
+from instrument.calibrate.graph import counted, freedom, tied
+from instrument.calibrate.lanes import Lanes
+from instrument.calibrate.suspects import suspects
+from instrument.errors import Outcome
+from instrument.units import Bool, Complex, Float, Int
+from instrument.visibilities import Visibilities
+
+if TYPE_CHECKING:
+    from instrument.calibrate.selfcal import SelfCal
+
+Cell = tuple[slice, slice]  # times and channels of an interval
+
+
+@dataclass
+class Part:
+    """Solutions of the lanes of one chunk; `suspects` the samples (N,) of the lanes that have any."""
+
+    jones: Complex
+    outcome: list[Outcome]
+    iterations: Int
+    residual: Float
+    worst: Float
+    history: Float
+    gauges: dict[int, Gauge]
+    suspects: dict[int, Bool]
+
+
+@dataclass
+class Job:
+    """What all chunks of one solve share."""
+
+    settings: SelfCal
+    visibilities: Visibilities
+    data: Complex
+    model: Complex
+    weight: Float
+    gauge: Gauge
+
+    def solve(self, cells: list[Cell]) -> Part:
+        """Solve the intervals `cells` side by side."""
+        a1, a2 = self.visibilities.antenna1, self.visibilities.antenna2
+        stations, s = len(self.visibilities.layout), self.settings
+        v, m, w = self._gathered(cells)
+        finite: Any = np.isfinite(m).all(axis=(-3, -2, -1)) if m.size else np.ones(len(cells), bool)
+        m = np.where(np.isfinite(m), m, 0.0)
+        v, m, level = _scaled(v, m, w, s.pattern == "phase")
+        power = m.real**2 + m.imag**2
+        each = power.reshape(len(cells), -1, len(a1), 2, 2).sum(axis=1)
+        used = counted(each)
+        active = used.any(axis=(2, 3)) @ _ends(a1, a2, stations) > 0
+        held = tied(used, a1, a2, stations, s.pattern)
+        inside = held[:, a1] & held[:, a2]
+        on = used.any(axis=(2, 3)) & inside
+        if not on.all():  # data without a model count as left over; those of other pieces of the graph do not
+            rows = v.shape[1] // len(a1)
+            v = np.where(np.tile(inside, rows)[..., None, None], v, 0.0)
+            m, power = (np.where(np.tile(on, rows)[..., None, None], x, 0.0) for x in (m, power))
+        samples = (power.sum(axis=(2, 3)).reshape(len(cells), -1, len(a1)) > 0).sum(axis=1)
+        lanes = Lanes(v, m, a1, a2, held, s)
+        jones, step, count, history = lanes.iterate(self._start(cells, held, level))
+        left = lanes.left(jones, samples)
+        fit = Fits(jones, step, count, left, strange(left, a1, a2, stations, s.tolerance, s.pattern))
+        hard = (
+            ((step > s.tolerance) | left.poor(s.unexplained) | left.uneven | fit.odd.any(axis=1))
+            & finite
+            & held.any(axis=1)
+        )
+        if hard.any():
+            fit.improve(lanes, np.flatnonzero(hard), s)
+        jones, poor = fit.jones, fit.left.poor(s.unexplained) | fit.odd.any(axis=1)
+        gauges = {}
+        outcome = []
+        for k in range(len(cells)):
+            free = common(lanes.form[k], float(lanes.model_power[k]), s.pattern)
+            if free.count > self.gauge.count and held[k].any():
+                gauges[k] = free
+            ended = self._outcome(finite[k], active[k], held[k], samples[k], free.count, fit.step[k])
+            if ended is Outcome.CONVERGED and poor[k]:
+                ended = Outcome.POOR_FIT
+            if ended is Outcome.CONVERGED and self._loose(cells[k], m[k], held[k], samples[k]):
+                ended = Outcome.SINGULAR
+            outcome.append(ended)
+        few = fit.odd.any(axis=1) | fit.left.few_fit(s.unexplained)
+        failed = few & [o in (Outcome.POOR_FIT, Outcome.ITERATION_LIMIT) for o in outcome]
+        found = suspects(v[failed], m[failed], a1, a2, held[failed], s) if failed.any() else {}
+        lost = np.flatnonzero(failed)
+        jones[[o is not Outcome.CONVERGED for o in outcome]] = np.nan
+        jones[~held] = np.nan
+        named = {int(lost[k]): mask for k, mask in found.items()}
+        return Part(
+            jones * level[:, None, None, None],
+            outcome,
+            fit.count,
+            fit.left.share,
+            fit.left.worst,
+            history,
+            gauges,
+            named,
+        )
+
+    def _gathered(self, cells: list[Cell]) -> tuple[Complex, Complex, Float]:
+        """Data, model (L, N, 2, 2) and weights (L, N), N samples of all baselines; short intervals are padded."""
+        most = max((t.stop - t.start) * (f.stop - f.start) for t, f in cells)
+        baselines = self.data.shape[2]
+        v = np.zeros((len(cells), most * baselines, 2, 2), complex)
+        m = np.zeros_like(v)
+        w = np.zeros((len(cells), most * baselines))
+        for k, (t, f) in enumerate(cells):
+            piece = self.weight[t, f]
+            v[k, : piece.size] = self.data[t, f].reshape(-1, 2, 2)
+            m[k, : piece.size] = self.model[t, f].reshape(-1, 2, 2)
+            w[k, : piece.size] = piece.reshape(-1)
+        return v, m, w
+
+    def _start(self, cells: list[Cell], active: Bool, level: Float) -> Complex:
+        begin: Any = np.zeros((*active.shape, 2, 2), complex)
+        begin[...] = np.eye(2)
+        given: Any = self.settings.start
+        if given is None:  # data far from the model by a factor: it is a start of its own
+            return begin / np.where(np.abs(np.log2(level)) > 2, 1.0, level)[:, None, None, None]
+        for k, (t, f) in enumerate(cells):
+            at = self.visibilities.at.block(slice(t.start, t.start + 1), slice(f.start, f.start + 1))
+            first = given.jones(at)[0, 0, :, 0]
+            begin[k] = np.where(np.isfinite(first).all(axis=(-2, -1))[:, None, None], first, np.eye(2))
+        return begin / level[:, None, None, None]
+
+    def _outcome(self, finite: Any, active: Bool, held: Bool, samples: Int, free: int, step: Any) -> Outcome:
+        if not finite:
+            return Outcome.NON_FINITE
+        if not active.any():
+            return Outcome.REFUSED
+        unknown = UNKNOWNS[self.settings.pattern] * int(held.sum()) - free
+        if not held.any() or 8 * int(samples.sum()) < unknown or not np.isfinite(step):
+            return Outcome.SINGULAR
+        return Outcome.ITERATION_LIMIT if step > self.settings.tolerance else Outcome.CONVERGED
+
+    def _loose(self, cell: Cell, model: Complex, held: Bool, samples: Int) -> bool:
+        """Whether few baselines leave more open than a common matrix, and others are to be corrected with it."""
+        vis, used = self.visibilities, samples > 0
+        if self.settings.pattern != "full" or used.sum() >= 2 * held.sum():
+            return False
+        flag = np.broadcast_to(vis.flag, vis.data.shape[:3])[cell] | ~np.isfinite(vis.data[cell]).all(axis=(-2, -1))
+        wanted = ~flag.all(axis=(0, 1)) & held[vis.antenna1] & held[vis.antenna2]
+        if not np.any(wanted & ~used):
+            return False
+        every, alike = freedom(model, np.ones(len(model)), vis.antenna1, vis.antenna2, len(held))
+        return every > alike
+
+
+def _ends(a1: Int, a2: Int, stations: int) -> Int:
+    """Which stations (B, A) a baseline has."""
+    out = np.zeros((len(a1), stations), int)
+    out[np.arange(len(a1)), a1] = out[np.arange(len(a2)), a2] = 1
+    return out
+
+
+def _scaled(v: Complex, m: Complex, w: Float, together: bool) -> tuple[Complex, Complex, Float]:
+    """Data and model times the root of the weights, each lane near 1, and what its matrices are to be multiplied by.
+
+    Powers of two, of which a root is taken: nothing is rounded. 1e170 Jy squared would be infinite.
+    """
+    top = np.frexp(w.max(axis=1, initial=0.0))[1] // 2 * 2
+    root = np.sqrt(np.ldexp(w, -top[:, None]))[..., None, None]
+    v, m = (np.where(root > 0, x, 0.0) * root for x in (v, m))
+    sizes = [np.abs(x.view(float)).reshape(len(x), -1).max(axis=1, initial=0.0) for x in (v, m)]
+    # an even number: the root of the ratio is a power of two as well
+    above, below = (np.clip(np.frexp(np.where(np.isfinite(x), x, 1.0))[1] // 2 * 2, -1000, 1022) for x in sizes)
+    if together:
+        above = below = np.maximum(above, below)
+    for x, power in ((v, above), (m, below)):
+        x *= np.ldexp(1.0, -power)[:, None, None, None]
+    return v, m, np.ldexp(1.0, (above - below) // 2)
