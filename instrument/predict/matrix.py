@@ -48,6 +48,7 @@ class Matrix(Predictor):
         matrices = float(slots * sources * shares)
         flops = gemm + 40 * phasors + 600 * matrices
         seconds = gemm / 25e9 + 2.5e-9 * phasors + 4e-7 * matrices + 4e-9 * slots * sources * stations
+        seconds += 4e-7 * slots * len(problem.antenna1)  # sorting products into baselines
         scalars = 16 * stations * sources
         shared = 64 * shares * sources * (8 if shares <= FEW else 4)
         wide = 16 * 8 * stations * sources if shares > FEW else 0
