@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from abc import abstractmethod
 from typing import Any, ClassVar, Literal
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from instrument import mat2
 from instrument.component import Component
-from instrument.errors import InputError, InstrumentWarning
+from instrument.errors import InputError, warn
 from instrument.jones.base import ElementBeam, JonesTerm
 from instrument.jones.chain import Chain
 from instrument.jones.feed import FeedTerm
@@ -148,9 +147,7 @@ def warn_outside_band(chain: Chain, freq_hz: Float) -> None:
         low, high = term.band_hz()
         outside = freq_hz[(freq_hz < low) | (freq_hz > high)]
         if outside.size:
-            warnings.warn(
+            warn(
                 f"{type(term).__name__} was made for {low / 1e6:g} to {high / 1e6:g} MHz: it extrapolates at "
-                f"{outside.min() / 1e6:g} MHz" + (f" to {outside.max() / 1e6:g} MHz" if outside.size > 1 else ""),
-                InstrumentWarning,
-                stacklevel=3,
+                f"{outside.min() / 1e6:g} MHz" + (f" to {outside.max() / 1e6:g} MHz" if outside.size > 1 else "")
             )

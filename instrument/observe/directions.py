@@ -8,13 +8,12 @@ One direction serves all stations of an array.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from instrument.errors import InputError, InstrumentWarning
+from instrument.errors import InputError, warn
 from instrument.units import Direction, Float
 
 LIGHT = 299792458.0
@@ -87,11 +86,9 @@ def earth_frame(times: Any, site_m: Float) -> EarthFrame:
         pole_x, pole_y = table.pm_xy(jd1, jd2)
     outside = np.asarray(status) < 0
     if outside.any():
-        warnings.warn(
+        warn(
             f"{outside.sum()} of {outside.size} times lie outside the Earth orientation table: UT1-UTC is taken as 0 "
-            "there, an error of up to 0.9 s (13.5 arcsec)",
-            InstrumentWarning,
-            stacklevel=2,
+            "there, an error of up to 0.9 s (13.5 arcsec)"
         )
     ut1_utc = np.where(outside, 0.0, ut1_utc.to_value("s"))
     xp = np.where(outside, 0.0, pole_x.to_value("rad"))
