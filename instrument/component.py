@@ -24,14 +24,16 @@ from pydantic import (
     model_validator,
 )
 
+from instrument.checked import checked
 from instrument.errors import InputError, did_you_mean
-from instrument.numbers import brief
+from instrument.numbers import Index, brief
 from instrument.registry import load, plugin_class, plugin_name
 
 KIND = "kind"  # the key under which text names a class: a plugin by its name, another component by its class name
 OLD_TAG = "component"  # "module:Class", written until 2026-11; understood for classes that are known, never imported
 
 
+@checked
 class Component(BaseModel, ABC):
     """A frozen set of named, validated settings; equal when its fields are equal.
 
@@ -83,7 +85,7 @@ class Component(BaseModel, ABC):
             return type(self).__pydantic_serializer__.to_python(self, mode=info.mode)
         return {KIND: public_name(type(self)), **fields}
 
-    def to_json(self, indent: int | None = None) -> str:
+    def to_json(self, indent: Index | None = None) -> str:
         """The component as JSON text; every value with a unit is a string with that unit."""
         return json.dumps(self.to_dict(), indent=indent)
 

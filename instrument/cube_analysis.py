@@ -14,6 +14,7 @@ from instrument.analyze.channel_grid import even_channels
 from instrument.analyze.cube_checks import check_cells, check_faraday
 from instrument.analyze.fourier import Stokes, Taper
 from instrument.analyze.signal import DEFAULT, Signal21cm
+from instrument.checked import checked
 from instrument.component import Component
 from instrument.cube_results import CubeResults
 from instrument.errors import InputError, InstrumentWarning
@@ -28,6 +29,7 @@ Share = Annotated[float, Field(ge=0, lt=1)]
 MOST_DEPTHS = 20001
 
 
+@checked
 class CubeAnalysis(Component):
     """Which products of a cube, and their settings; without `products` all that the cube allows.
 

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from instrument import mat2
+from instrument.checked import checked
 from instrument.component import Component
 from instrument.errors import InputError, warn
 from instrument.jones.base import ElementBeam, JonesTerm
@@ -22,6 +23,7 @@ from instrument.units import Complex, Direction, Float, direction, icrs_of, inst
 State = Literal["absolute", "differential"]
 
 
+@checked
 class Instrument(Component):
     """A radio interferometer: a subclass has its own fields and gives `layout()` and `chain()`.
 
@@ -124,6 +126,7 @@ class Instrument(Component):
         return Sampling.build(self.layout(), when, freq, ra, dec, centre)
 
 
+@checked
 class Composed(Instrument):
     """An instrument put together by hand from a layout and Jones terms, receiver to sky."""
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from instrument.check import BY_STATIONS, DEFINITION, SHARE, Check, Checker, not_checked, watch
+from instrument.checked import checked
 from instrument.errors import RefusedError
 from instrument.predict.base import Predictor, Problem, Work
 from instrument.predict.direct import Direct
@@ -27,6 +28,7 @@ class Item(NamedTuple):
     bound: float = 0.0
 
 
+@checked
 @dataclass(frozen=True)
 class Plan:
     """What will be done. Print it; `run` it at once or take `blocks` one by one; `verify` it against the definition."""

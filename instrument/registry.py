@@ -12,7 +12,8 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from instrument.errors import InputError, PluginError, did_you_mean
+from instrument.checked import checked
+from instrument.errors import PluginError, did_you_mean
 
 KINDS = ("elements", "telescopes", "engines", "foregrounds", "skies")
 
@@ -49,6 +50,7 @@ def _package(point: EntryPoint) -> str:
     return point.dist.name if point.dist else point.module.split(".")[0]
 
 
+@checked
 def available(kind: str) -> dict[str, Plugin]:
     """Every registered plugin of a kind, by name; a broken one says why and does not stop the rest."""
     listing = {}
@@ -96,8 +98,7 @@ def plugin_name(kind: str, cls: type) -> str | None:
     return next((n for n, points in _found(kind).items() if [p.value for p in points] == [value]), None)
 
 
+@checked
 def load(kind: str, name: str, /, **settings: Any) -> Any:
     """The plugin `name` of `kind`, constructed with `settings`; raises `PluginError` or `InputError`."""
-    if not isinstance(name, str):
-        raise InputError(f"a plugin is loaded by its name, got {name!r}")
     return _resolve(kind, name)(**settings)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from instrument.checked import checked
 from instrument.component import Component
 from instrument.model import Instrument
 from instrument.observe.observation import Observation
@@ -12,6 +13,7 @@ from instrument.planner import make_plan
 from instrument.sky.base import Sky
 
 
+@checked
 class Scene(Component):
     """What is observed, with what, and when; `plan()` says what would be done, nothing is computed before `run`."""
 

@@ -155,7 +155,8 @@ def plain(value: Any, dtype: type, name: str, finite: bool = False, at_least: fl
         raise UnitError(f"{name} takes plain numbers in SI units, got values in '{value.unit}': use .to_value(...)")
     try:
         given = np.asarray(value)
-        if given.size and (given.dtype.kind in "USOMmV" or (given.dtype.kind == "c" and np.dtype(dtype).kind != "c")):
+        kind, wanted = given.dtype.kind, np.dtype(dtype).kind
+        if given.size and (kind in "USOMmV" or (kind == "c" and wanted != "c") or (kind == "b" and wanted != "b")):
             raise TypeError(f"got {brief(value)}")
         array: Any = np.array(given, dtype=dtype)
     except (TypeError, ValueError, OverflowError) as error:
@@ -291,8 +292,8 @@ def instants(value: object, name: str = "times") -> Any:
 
     try:
         time = value if isinstance(value, Time) else Time(value, scale="utc")
-    except ValueError:
-        raise InputError(f"{name} = {value!r} is not a UTC time; write it like '2012-12-07T23:00:00'") from None
+    except (ValueError, TypeError, AttributeError):
+        raise InputError(f"{name} = {brief(value)} is not a UTC time; write it like '2012-12-07T23:00:00'") from None
     return time.utc.reshape((-1,)) if not time.isscalar else time.utc.reshape((1,))
 
 

@@ -16,13 +16,15 @@ from instrument.analyze.photometry import ForcedPhotometry, SourceFluxes
 from instrument.analyze.signal import Signal21cm
 from instrument.analyze.spectra import Spectrum2D, spectrum_2d
 from instrument.analyze.window import EoRWindow, eor_window
+from instrument.checked import checked
 from instrument.errors import InputError
 from instrument.image.cube import StokesCube
 from instrument.sky.base import Sky
-from instrument.units import Direction
+from instrument.units import Direction, Index
 from instrument.visibilities import Visibilities
 
 
+@checked
 class Analyzer:
     """What can be learnt from a cube, from visibilities with a known sky, or from both.
 
@@ -43,7 +45,7 @@ class Analyzer:
         self.fluxes = fluxes
         self.centre = centre
 
-    def leakage(self, photometry: ForcedPhotometry | None = None, channel: int = 0) -> Leakage:
+    def leakage(self, photometry: ForcedPhotometry | None = None, channel: Index = 0) -> Leakage:
         """Leakage of every source by forced photometry in the visibilities, in one channel.
 
         Needs the visibilities (or blocks of them) and the sky they were made from, or fluxes measured before.
@@ -63,7 +65,7 @@ class Analyzer:
     def spectrum_2d(
         self,
         stokes: Stokes = "I",
-        channel: int = 0,
+        channel: Index = 0,
         uv_range: tuple[float, float] | None = None,
         taper: Taper | None = None,
         bins: Any = 15,

@@ -12,7 +12,7 @@ from instrument.analyze.channel_grid import even_channels, infill_operator, same
 from instrument.analyze.fourier import Stokes, Taper, check_stokes, comoving, line_of_sight, taper_of, uv_limits
 from instrument.errors import InputError, InstrumentWarning
 from instrument.image.cube import StokesCube
-from instrument.units import Bool, Complex, Float, Int, to_si
+from instrument.units import Bool, Complex, Float, Int, one_si
 
 if TYPE_CHECKING:
     from instrument.analyze.cylinders import Cylindrical, Spherical
@@ -108,6 +108,7 @@ def cells_of(
     variance (Parseval). Raises `InputError` for cubes that have no such spectrum.
     """
     check_stokes(stokes)
+    infill = None if infill is None else one_si(infill, "s", "infill", above=0)
     order, grid_hz, here = even_channels(cube, infill is not None)
     freq = float((grid_hz[0] + grid_hz[-1]) / 2)
     z, distance = comoving(freq, redshift, cosmology)
@@ -148,7 +149,7 @@ def cells_of(
             found /= response
         if not here.all():
             some, found = found, np.empty((len(grid_hz), use.size), complex)
-            found[here], found[~here] = some, infill_operator(grid_hz, here, float(to_si(infill, "s", "infill"))) @ some
+            found[here], found[~here] = some, infill_operator(grid_hz, here, infill) @ some
         spectra.append(found)
     n = len(grid_hz)
     square = float((window**2).mean() * (along**2).mean())

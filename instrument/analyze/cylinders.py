@@ -12,8 +12,9 @@ import numpy as np
 
 from instrument.analyze.cells import Cells, Frame
 from instrument.analyze.fourier import bin_edges, per_mpc, sine
+from instrument.checked import checked
 from instrument.errors import InputError
-from instrument.units import Float, Int
+from instrument.units import FINITE, Float, Int
 from instrument.whole_file import write_ecsv
 
 
@@ -54,6 +55,7 @@ class _Spectrum(ABC):
         write_ecsv(self.table(), path)
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Cylindrical(_Spectrum):
     """Power spectrum of a cube in bins of k_perp (P,) and |k_par| (L,): P = V / N² mean |DFT|², `unit`² Mpc³ (P, L).
@@ -117,10 +119,8 @@ class Cylindrical(_Spectrum):
         squared, per_mpc = u.Unit(self.unit) ** 2, 1 / u.Mpc
         shape = self.power.shape
         out = QTable()
-        for name, values, edges, axis in (
-            ("k_perp", self.k_perp, self.perp_edges, 0),
-            ("k_par", self.k_par, self.par_edges, 1),
-        ):
+        axes = (("k_perp", self.k_perp, self.perp_edges, 0), ("k_par", self.k_par, self.par_edges, 1))
+        for name, values, edges, axis in axes:
             for part, column in ((name, values), (f"{name}_low", edges[:-1]), (f"{name}_high", edges[1:])):
                 wide = column[:, None] if axis == 0 else column
                 out[part] = np.broadcast_to(wide, shape).ravel() * per_mpc
@@ -131,6 +131,7 @@ class Cylindrical(_Spectrum):
         return out
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Spherical(_Spectrum):
     """Power spectrum of a cube in bins of k (N,), `unit`² Mpc³; fields as those of `Cylindrical`."""
@@ -227,7 +228,7 @@ def cylindrical(
 def spherical(cells: Cells, bins: Any = 15, log: bool = True, wedge: Any = None, k_par_min: Any = None) -> Spherical:
     """Cells in bins of k, those of the wedge or of small k_par left out where asked; see `Analyzer.spherical`."""
     slope = cells.frame.horizon_slope * sine(wedge)
-    least = float(per_mpc(0.0 if k_par_min is None else k_par_min, "k_par_min"))
+    least = FINITE.check(float(per_mpc(0.0 if k_par_min is None else k_par_min, "k_par_min")), "k_par_min")
     if not 0 <= least < cells.k_par[-1]:
         raise InputError(f"k_par_min = {k_par_min} is not within 0 to {cells.k_par[-1]:.3g} /Mpc")
     # of every delay, the cells (u, v) that are above the wedge: the first so many

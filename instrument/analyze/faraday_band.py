@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from instrument.analyze.fourier import comoving, line_of_sight
+from instrument.checked import checked
 from instrument.compiled import compiled
 from instrument.errors import InputError
 from instrument.observe.directions import LIGHT
@@ -22,7 +23,7 @@ def number(value: Any, unit: str, name: str) -> Float:
     """Finite numbers of any shape in a unit, given bare or as a `Quantity`; raises `InputError` for others."""
     out = np.asarray(to_si(value, unit, name) if getattr(value, "unit", None) is not None else value)
     wanted = "finite numbers" + (f" in {unit}" if unit else "")
-    if out.dtype.kind not in "biuf":
+    if out.dtype.kind not in "iuf":
         raise InputError(f"{name} must be {wanted}, got {type(value).__name__} of {out.dtype}")
     if not np.isfinite(out).all():
         raise InputError(f"{name} must be {wanted}, got {out[~np.isfinite(out)].flat[0]}")
@@ -81,6 +82,7 @@ def half_height(lambda2: Any, weights: Any) -> float:
     return 0.5 * (left + right)
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class FaradayBand:
     """Figures of a band of N channels (those with weight), from lambda² in m² (N,) and weights (N,); depths in rad/m².
@@ -204,6 +206,7 @@ def _per_depth(freq_hz: Any, cosmology: Any) -> float:
     return float(2 * np.pi * delay / line_of_sight(redshift, cosmology))
 
 
+@checked
 def k_par_of_depth(depths: Any, freq_hz: Any, cosmology: Any = None) -> Float:
     """k_parallel in 1/Mpc where emission at Faraday depths in rad/m² appears; the shape and sign of the depths.
 
@@ -213,6 +216,7 @@ def k_par_of_depth(depths: Any, freq_hz: Any, cosmology: Any = None) -> Float:
     return number(depths, "rad/m2", "depths") * _per_depth(freq_hz, cosmology)
 
 
+@checked
 def depth_of_k_par(k_par: Any, freq_hz: Any, cosmology: Any = None) -> Float:
     """Faraday depth in rad/m² whose emission appears at k_par in 1/Mpc: the inverse of `k_par_of_depth`."""
     return number(k_par, "1/Mpc", "k_par") / _per_depth(freq_hz, cosmology)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from instrument.analyze.faraday_band import FaradayBand, number
+from instrument.checked import checked
 from instrument.observe.directions import LIGHT
 from instrument.units import Complex, Direction, Float
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from instrument.analyze.faraday_peaks import FaradayPeaks
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class FaradayCube:
     """Faraday dispersion function, complex (N, Ny, Nx), at depths in rad/m² (N,), in `unit` per RMSF.

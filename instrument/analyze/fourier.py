@@ -9,7 +9,7 @@ import numpy as np
 from instrument.errors import InputError, did_you_mean
 from instrument.image.cube import StokesCube
 from instrument.observe.directions import LIGHT
-from instrument.units import Complex, Float, Int, to_si
+from instrument.units import COUNT, Complex, Float, Int, plain, to_si
 
 HYDROGEN = 1420405751.768  # Hz, the 21-cm line at rest
 Stokes = Literal["I", "Q", "U", "V", "P"]
@@ -97,7 +97,7 @@ def line_of_sight(redshift: float, cosmology: Any) -> float:
 
 def per_mpc(k: Any, name: str = "k") -> Float:
     """Wavenumbers (any shape) in 1/Mpc: plain numbers are, a Quantity is converted (h/Mpc is refused: no h here)."""
-    return np.asarray(k if getattr(k, "unit", None) is None else to_si(k, "1/Mpc", name), float)
+    return np.asarray(plain(k, float, name) if getattr(k, "unit", None) is None else to_si(k, "1/Mpc", name), float)
 
 
 def sine(wedge: Any) -> float:
@@ -110,8 +110,8 @@ def sine(wedge: Any) -> float:
 
 def bin_edges(low: float, high: float, bins: Any, log: bool) -> Float:
     """Edges in 1/Mpc (N + 1,): `bins` of them, equal in ln k or in k, or the edges given with their unit."""
-    if isinstance(bins, int | np.integer):
-        edges = (np.geomspace if log else np.linspace)(low, high, max(int(bins), 0) + 1)
+    if getattr(bins, "unit", None) is None and np.ndim(bins) == 0:
+        edges = (np.geomspace if log else np.linspace)(low, high, COUNT.check(bins, "bins") + 1)
     else:
         edges = np.atleast_1d(to_si(bins, "1/Mpc", "bins"))
     if edges.ndim != 1 or len(edges) < 2 or not (np.diff(edges) > 0).all() or edges[0] < 0:

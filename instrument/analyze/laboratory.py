@@ -21,6 +21,7 @@ from instrument.analyze.offsets import OffsetSums
 from instrument.analyze.sweep import Sweep, find_ghosts, ranks
 from instrument.calibrate.base import Solution
 from instrument.calibrate.selfcal import SelfCal
+from instrument.checked import checked
 from instrument.component import Component
 from instrument.errors import InputError, Outcome
 from instrument.image.cube import StokesCube
@@ -32,12 +33,13 @@ from instrument.plan import Plan
 from instrument.planner import BLOCK_BYTES
 from instrument.predict.base import Problem
 from instrument.sky.points import PointSky
-from instrument.units import Complex, Int, Jansky
+from instrument.units import Complex, Int, Jansky, Seed
 from instrument.visibilities import Visibilities
 
 SOLVED_TOGETHER = 16  # solutions of a block for each worker: the vector lanes of SelfCal
 
 
+@checked
 class IncompleteModel(Component):
     """Calibrates on the n brightest sources for every n of `models`, and measures what that does to the sky.
 
@@ -55,7 +57,7 @@ class IncompleteModel(Component):
     uv_range: tuple[float, float] | None = None
     every: Annotated[int, Field(ge=1)] = 1
     sefd: Jansky | None = None
-    seed: int = 0
+    seed: Seed = 0
 
     @field_validator("models")
     @classmethod

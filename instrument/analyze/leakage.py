@@ -10,6 +10,7 @@ import numpy as np
 
 from instrument import mat2
 from instrument.analyze.photometry import SourceFluxes
+from instrument.checked import checked
 from instrument.jones.chain import Chain
 from instrument.jones.mueller import TO_LINEAR, TO_STOKES
 from instrument.observe.directions import separation
@@ -21,6 +22,7 @@ NULL = 0.01  # apparent over true flux below which a source lies near a null of 
 CLEAR = 0.1  # % of I: error up to which a leakage counts as measured; never by its own value, which would select
 
 
+@checked
 @dataclass(frozen=True)
 class Leakage:
     """Leakage of every source, one channel: fluxes (G, 4) in Jy, leakages in % of its apparent I (G,).

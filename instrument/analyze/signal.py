@@ -10,14 +10,16 @@ from typing import Any
 import numpy as np
 
 from instrument.analyze.fourier import comoving, line_of_sight, per_mpc
+from instrument.checked import checked
 from instrument.errors import InputError, InstrumentWarning, did_you_mean
 from instrument.image.cube import StokesCube
-from instrument.units import Float, Int, to_si
+from instrument.units import Count, Float, Int, Seed, to_si
 
 TABLE = "eor_21cm_z9.ecsv"
 DEFAULT = "21cmFAST_2011_z9.50"  # closest public table to the curve of Asad et al. (2015)
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Signal21cm:
     """A spherical spectrum of the 21-cm signal: Delta² = k³ P / 2 pi² in mK² (N,) at `k` in 1/Mpc (N,), growing.
@@ -86,16 +88,16 @@ class Signal21cm:
 
     def cylindrical(self, k_perp: Any, k_par: Any) -> Float:
         """The paper's cylindrical Delta² in mK² (P, L): Delta²(k) k_perp² k_par / 2 k³, as `Cylindrical.delta2`."""
-        k_perp, k_par = per_mpc(k_perp)[:, None], per_mpc(k_par)
+        k_perp, k_par = np.atleast_1d(per_mpc(k_perp, "k_perp"))[:, None], np.atleast_1d(per_mpc(k_par, "k_par"))
         k = np.hypot(k_perp, k_par)
         return np.asarray(self.delta2(k) * k_perp**2 * k_par / (2 * k**3))
 
     def cube(
         self,
-        pixels: int | tuple[int, int],
+        pixels: Count | tuple[Count, Count],
         pixel: Any,
         frequencies: Any,
-        seed: int,
+        seed: Seed,
         periodic: bool = True,
         redshift: float | None = None,
         cosmology: Any = None,

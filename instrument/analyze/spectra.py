@@ -20,12 +20,14 @@ from instrument.analyze.fourier import (
     taper_of,
     uv_limits,
 )
+from instrument.checked import checked
 from instrument.errors import InputError, InstrumentWarning
 from instrument.image.cube import StokesCube
 from instrument.units import Float, Int
 from instrument.whole_file import write_ecsv
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Spectrum2D:
     """Power spectrum of an image in N bins of k_perp: P = (area / pixels²) mean |DFT|², in `unit`² Mpc² (N,).

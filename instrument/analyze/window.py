@@ -11,11 +11,13 @@ import numpy as np
 from instrument.analyze.cylinders import Cylindrical, demand_same
 from instrument.analyze.fourier import per_mpc
 from instrument.analyze.signal import Signal21cm
+from instrument.checked import checked
 from instrument.errors import InputError
-from instrument.units import Bool, Float
+from instrument.units import FINITE, Bool, Float
 from instrument.whole_file import write_ecsv
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class EoRWindow:
     """Bins (k_perp, k_par) of a spectrum of leakage in K, and the 21-cm power `signal` in them, K² Mpc³ (P, L).
@@ -146,7 +148,7 @@ def eor_window(
         raise InputError(f"the spectrum is in {leakage.unit}, the signal in K: take the spectrum of cube.to_kelvin()")
     if noise is not None:
         demand_same(leakage, noise)
-    least = float(per_mpc(k_par_min, "k_par_min"))
+    least = FINITE.check(float(per_mpc(k_par_min, "k_par_min")), "k_par_min")
     if not least >= 0:
         raise InputError(f"k_par_min = {k_par_min} must be 0 /Mpc or more")
     line = np.zeros(len(leakage.k_perp)) if wedge is None else leakage.wedge(wedge)

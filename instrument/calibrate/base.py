@@ -13,6 +13,7 @@ import numpy as np
 from instrument import mat2
 from instrument.calibrate.fit import doubts
 from instrument.calibrate.gauge import Gauge
+from instrument.checked import checked
 from instrument.component import Component
 from instrument.errors import InputError, InstrumentError, Outcome
 from instrument.jones.base import JonesTerm
@@ -24,6 +25,7 @@ from instrument.units import Bool, Complex, Float, Int
 from instrument.visibilities import Visibilities
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Solution:
     """Solved Jones matrices of every interval: `term` goes into any `Chain`, or into `vis.corrected`.
@@ -130,6 +132,7 @@ class Solution:
         )
 
 
+@checked
 class Calibrator(Component):
     """A solver: `solve(data, model)` finds the station terms that turn the model into the data."""
 

@@ -15,6 +15,7 @@ from pydantic import BeforeValidator, Field
 from instrument.calibrate.base import Calibrator, Solution, pair
 from instrument.calibrate.clusters import Block, Limits
 from instrument.calibrate.gauge import gauge_of
+from instrument.checked import checked
 from instrument.errors import InputError, InstrumentError, Outcome, did_you_mean
 from instrument.jones.base import JonesTerm
 from instrument.jones.table import JonesTable
@@ -89,6 +90,7 @@ def _seconds_by_name(given: Any) -> Any:
     return {name: f"{value!r} s" for name, value in seconds.items()}
 
 
+@checked
 class DirectionalCal(Calibrator):
     """Direction-dependent solve of V_ab = sum_c J_a^c M_ab^c J_b^cH for all clusters c at once.
 

@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from instrument.checked import checked
 from instrument.errors import FileError, InputError
 from instrument.files.fits import read_cube
 from instrument.image.cube import Psf, StokesCube
 from instrument.image.psf import fit_psf
 
 
+@checked
 def read_psf(path: str | os.PathLike[str], cube: StokesCube) -> Psf:
     """PSF of a cube: images (F, Ny, Nx) of a FITS file, peak 1 at the centre pixel, and the beams fitted to them.
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from instrument.checked import checked
 from instrument.errors import FileError
 from instrument.files_in import harmless, read_regular
 from instrument.units import Float
@@ -38,6 +39,7 @@ def read_numbers(path: str | os.PathLike[str], what: str = "numbers") -> Float:
     return np.array(found)
 
 
+@checked
 def read_frequencies(path: str | os.PathLike[str]) -> Any:
     """Frequencies of a text file, in Hz, one a line, as a `Quantity` (F,): for `read_cube(..., frequencies=...)`."""
     from astropy import units as u

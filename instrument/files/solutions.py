@@ -6,6 +6,7 @@ transposed here. Times are MJD seconds, UTC, as ours.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib import metadata
@@ -16,6 +17,7 @@ import numpy as np
 from instrument import mat2
 from instrument.calibrate.base import Solution
 from instrument.calibrate.directional import DirectionalSolution
+from instrument.checked import checked
 from instrument.errors import FileError, InputError, did_you_mean
 from instrument.files.h5parm import AXES, KINDS, POLS, read_soltabs
 from instrument.jones.lookup import nearest
@@ -28,8 +30,9 @@ from instrument.whole_file import whole_file
 Pattern = Literal["full", "diagonal", "scalar", "phase"]
 
 
+@checked
 def write_h5parm(
-    path: Any,
+    path: str | os.PathLike[str],
     solution: Solution | DirectionalSolution | JonesTable,
     pattern: Pattern = "full",
     at: Sampling | None = None,
@@ -127,8 +130,9 @@ def _common_times(tables: Sequence[JonesTable], lengths: Sequence[float]) -> Flo
     return edge + (np.array(sorted(pieces)) + 0.5) * step
 
 
+@checked
 def read_h5parm(
-    path: Any,
+    path: str | os.PathLike[str],
     layout: Layout | None = None,
     direction: str | None = None,
     solset: str | None = None,

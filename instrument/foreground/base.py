@@ -10,17 +10,19 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from instrument.checked import checked
 from instrument.component import Component
 from instrument.errors import InputError, InstrumentWarning, Outcome
 from instrument.foreground.linear import apply
 from instrument.foreground.score import Score, estimated_score, true_score
 from instrument.image.cube import StokesCube
-from instrument.units import Bool, Float, Int
+from instrument.units import Bool, Float, Int, Seed
 
 Plane = Literal["I", "Q", "U", "V"]
 LARGEST = 1e100  # squares of what is larger, or smaller than 1/LARGEST, leave float64
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Separation:
     """What a remover found in maps (F, Ny, Nx): how it ended, one line about it, the foreground in one of two forms.
@@ -126,6 +128,7 @@ class Clean:
         return out
 
 
+@checked
 class Split:
     """A cube taken apart: `foreground` and `residual`, cubes with cube = foreground + residual; other Stokes untouched.
 
@@ -192,7 +195,7 @@ class Split:
         k_par: float = 0.06,
         k_perp: tuple[float, float] = (0.02, 0.5),
         taper: str | None = "blackman-harris",
-        seed: int = 0,
+        seed: Seed = 0,
     ) -> Score:
         """Power of what the removal got wrong over that of the foreground: 1 is nothing gained, above 1 is worse.
 
@@ -238,6 +241,7 @@ class Split:
         )
 
 
+@checked
 class ForegroundRemover(Component):
     """Splits a cube into foreground and residual: `split(cube) -> Split`.
 

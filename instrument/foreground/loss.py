@@ -10,6 +10,7 @@ import numpy as np
 
 from instrument.analyze.analyzer import Analyzer
 from instrument.analyze.fourier import Taper
+from instrument.checked import checked
 from instrument.errors import InputError
 from instrument.foreground.base import ForegroundRemover
 from instrument.image.cube import StokesCube
@@ -19,6 +20,7 @@ from instrument.whole_file import write_ecsv
 WEAK = 1e-9  # of the largest power of the signal in a bin: less is rounding of cubes in float32
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class SignalLoss:
     """Spectra of an injected signal s and of what is left of it, d = residual with it - residual without (Np, Nl).
@@ -77,6 +79,7 @@ class SignalLoss:
         write_ecsv(self.table(), path)
 
 
+@checked
 def signal_loss(
     remover: ForegroundRemover,
     cube: StokesCube,

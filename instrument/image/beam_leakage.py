@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from instrument.checked import checked
 from instrument.errors import InputError, InstrumentWarning
 from instrument.image.cube import StokesCube
 from instrument.image.mocks import add_leakage
@@ -17,6 +18,7 @@ from instrument.units import Float
 ENOUGH = 0.01  # of the largest entry: interpolation errors above are said
 
 
+@checked
 def leaked_through(
     cube: StokesCube,
     instrument: Instrument,

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
+from instrument.checked import checked
 from instrument.component import Component
 from instrument.errors import InputError, RefusedError
 from instrument.image.cube import Psf, StokesCube
@@ -20,6 +21,7 @@ from instrument.visibilities import Visibilities
 HELD = 1_000_000  # visibilities gridded at once: bounds memory (90 MB) and keeps the fixed cost of a call small
 
 
+@checked
 class Imager(Component):
     """Dirty images of `pixels` x `pixels` of `pixel` each, from baselines within `uv_range` (wavelengths).
 

@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from instrument.checked import checked
 from instrument.component import Component
 from instrument.errors import InputError
 from instrument.image.cube import Psf, StokesCube
 from instrument.observe.directions import LIGHT
-from instrument.units import Complex, Float, Radians, direction, to_si
+from instrument.units import Complex, Float, Radians, Seed, direction, to_si
 
 ARCMIN = np.pi / 180 / 60
 REFERENCE = 150e6  # Hz
@@ -73,11 +74,12 @@ FINE = Screens(
 )
 
 
+@checked
 def polarized_screens(
     pixels: int = 480,
     pixel: Any = "0.5 arcmin",
     frequencies: Any = None,
-    seed: int = 196,
+    seed: Seed = 196,
     screens: Screens = TEN,
     centre: Any = None,
 ) -> StokesCube:
@@ -120,6 +122,7 @@ def polarized_screens(
     return StokesCube(data, freq * u.Hz, step * u.rad, "K", at, psf)
 
 
+@checked
 def leaked(
     cube: StokesCube,
     fraction: float = 0.003,
@@ -164,7 +167,8 @@ def add_leakage(planes: Any, maps: Any) -> None:
             planes[0] += leak * planes[k]
 
 
-def noise_cube(like: StokesCube, sigma: Any, psf_shaped: bool = False, seed: int = 0) -> StokesCube:
+@checked
+def noise_cube(like: StokesCube, sigma: Any, psf_shaped: bool = False, seed: Seed = 0) -> StokesCube:
     """Noise (F, 4, Ny, Nx) float32 of rms `sigma` in every pixel, on the axes of `like`; independent in I, Q, U, V.
 
     `sigma` has a unit, one or (F,). White per pixel, or (`psf_shaped`) as images of visibilities with natural weights

@@ -8,9 +8,10 @@ from typing import ClassVar, Literal, NamedTuple
 import numpy as np
 
 from instrument import mat2
+from instrument.checked import checked
 from instrument.component import Component
 from instrument.observe.sampling import Sampling
-from instrument.units import Complex, Float
+from instrument.units import Complex, Float, NotNegative
 
 Basis = Literal["sky", "horizon", "feed"]
 Structure = Literal["scalar", "diagonal", "full"]
@@ -28,6 +29,7 @@ class Simplified(NamedTuple):
     bound: float
 
 
+@checked
 class JonesTerm(Component):
     """One effect as Jones matrices, complex (T, F, A, S, 2, 2), axes of length 1 where it is constant.
 
@@ -84,11 +86,12 @@ class JonesTerm(Component):
         sizes = [len(at.layout)] if self.per_station == "shared" else np.bincount(at.layout.frames[1])
         return f"{type(self).__name__} shared by {'+'.join(str(n) for n in sorted(sizes, reverse=True))} stations"
 
-    def simplify(self, at: Sampling, tolerance: float) -> Simplified:
+    def simplify(self, at: Sampling, tolerance: NotNegative) -> Simplified:
         """What a scene needs of this term: itself, something simpler, or nothing; its bound is below `tolerance`."""
         return Simplified(self, "", 0.0)
 
 
+@checked
 class ScalarTerm(JonesTerm):
     """A term that is a number times the identity: a subclass gives `scalar`, complex (T, F, A, S)."""
 
@@ -103,6 +106,7 @@ class ScalarTerm(JonesTerm):
         return np.asarray(self.scalar(at)[..., None, None] * mat2.IDENTITY)
 
 
+@checked
 class ElementBeam(JonesTerm):
     """One antenna's pattern, horizon to feed, (T, F, A, S, 2, 2); zero below the antenna plane.
 

@@ -10,11 +10,12 @@ import numpy as np
 from pydantic import model_validator
 
 from instrument import mat2
+from instrument.checked import checked
 from instrument.component import Component
 from instrument.errors import BasisError
 from instrument.jones.base import JonesTerm, Simplified, Structure
 from instrument.observe.sampling import Sampling
-from instrument.units import Complex, Int
+from instrument.units import Complex, Int, NotNegative
 
 RANK: dict[str, int] = {"scalar": 0, "diagonal": 1, "full": 2}
 
@@ -33,6 +34,7 @@ class Factors:
     group: Int
 
 
+@checked
 class Chain(Component):
     """Product of Jones terms, (T, F, A, S, 2, 2), written from receiver to sky: `Chain(GainTerm(), StationBeam())`."""
 
@@ -81,7 +83,9 @@ class Chain(Component):
         """A bound on the largest singular value of the product anywhere; infinity where a term knows none."""
         return float(np.prod([t.peak(at) for t in self.parts]))
 
-    def simplified(self, at: Sampling, tolerance: float = 0.0) -> tuple[Chain, list[tuple[JonesTerm, Simplified]]]:
+    def simplified(
+        self, at: Sampling, tolerance: NotNegative = 0.0
+    ) -> tuple[Chain, list[tuple[JonesTerm, Simplified]]]:
         """What a scene needs of the chain, and what became of each term."""
         fates = [(term, term.simplify(at, tolerance)) for term in self.terms]
         return Chain(*(fate.term for _, fate in fates if fate.term is not None)), fates

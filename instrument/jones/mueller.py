@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from instrument import mat2
+from instrument.checked import checked
 from instrument.units import Complex, Float
 
 # vec(B) row-wise (pp, pq, qp, qq) of Stokes (I, Q, U, V), for B = [[I+Q, U+iV], [U-iV, I-Q]]
@@ -16,18 +17,21 @@ TO_LINEAR.setflags(write=False)
 TO_STOKES.setflags(write=False)
 
 
+@checked
 def brightness(stokes: Float) -> Complex:
     """Brightness matrices (..., 2, 2) of Stokes I, Q, U, V (..., 4): [[I+Q, U+iV], [U-iV, I-Q]]."""
     i, q, u, v = np.moveaxis(np.asarray(stokes, float), -1, 0)
     return mat2.pack(i + q, u + 1j * v, u - 1j * v, i - q)
 
 
+@checked
 def stokes(matrices: Complex) -> Complex:
     """Stokes (..., 4), complex, of 2x2 matrices: I = (pp+qq)/2, Q = (pp-qq)/2, U = (pq+qp)/2, V = (pq-qp)/2i."""
     pp, pq, qp, qq = (matrices[..., i, j] for i in range(2) for j in range(2))
     return np.stack([(pp + qq) / 2, (pp - qq) / 2, (pq + qp) / 2, (pq - qp) / 2j], axis=-1)
 
 
+@checked
 def mueller(jones_a: Complex, jones_b: Complex) -> Complex:
     """Mueller matrices S^-1 (J_a kron conj(J_b)) S, complex (..., 4, 4); real where both stations share one Jones.
 
@@ -73,6 +77,7 @@ class DIErrors:
         return np.asarray(out + np.eye(4))
 
 
+@checked
 def di_errors(jones_a: Complex, jones_b: Complex) -> DIErrors:
     """The seven parameters of baselines from the Jones matrices (..., 2, 2) of their stations, errors about 1."""
 
@@ -92,6 +97,7 @@ def di_errors(jones_a: Complex, jones_b: Complex) -> DIErrors:
     )
 
 
+@checked
 def ixr_jones(jones: Complex) -> Float:
     """Intrinsic cross-polarization ratio ((k+1)/(k-1))^2, k the condition number of J (Carozzi & Woan 2011).
 
@@ -102,6 +108,7 @@ def ixr_jones(jones: Complex) -> Float:
         return np.asarray(np.where(high > low, ((high + low) / (high - low)) ** 2, np.inf))
 
 
+@checked
 def ixr_mueller(jones: Complex) -> Float:
     """Mueller IXR (k^2+1)/(k^2-1) of a station's Jones matrix: the inverse of its largest leakage from I."""
     high, low = mat2.singular_values(jones)
@@ -109,6 +116,7 @@ def ixr_mueller(jones: Complex) -> Float:
         return np.asarray(np.where(high > low, (high**2 + low**2) / (high**2 - low**2), np.inf))
 
 
+@checked
 def leakage(matrices: Complex) -> tuple[Float, Float]:
     """Leakage of I into linear and circular polarization, fractions of M11 (...), of Mueller matrices (..., 4, 4)."""
     m11 = np.abs(matrices[..., 0, 0])

@@ -7,11 +7,13 @@ from typing import ClassVar
 import numpy as np
 
 from instrument import mat2
+from instrument.checked import checked
 from instrument.jones.base import Basis, JonesTerm, PerStation
 from instrument.observe.sampling import Sampling
 from instrument.units import Complex
 
 
+@checked
 class Parallactic(JonesTerm):
     """Sky to horizon basis, [[theta.north, theta.east], [phi.north, phi.east]], (T, 1, A, S, 2, 2).
 

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import model_validator
 
 from instrument import mat2
+from instrument.checked import checked
 from instrument.component import Component
 from instrument.errors import InputError
 from instrument.jones.base import Basis, ElementBeam, JonesTerm, PerStation, ScalarTerm
@@ -20,6 +21,7 @@ from instrument.units import ArrayOf, Complex, Float, Int, PositiveHertz, SkyDir
 Offsets = Annotated[Any, ArrayOf(float, (None, None, 3))]
 
 
+@checked
 class Level(Component):
     """One level of a phased station: M parts at ITRF offsets in m (A or 1, M, 3), steered to `pointing`.
 
@@ -44,6 +46,7 @@ class Level(Component):
         return self.offsets_m[first], which.reshape(-1)
 
 
+@checked
 class ArrayFactor(ScalarTerm):
     """Product over levels of mean exp(2 pi i (f d - f0 d0) . r / c), complex (T, F, A, S); 1 at the pointing.
 
@@ -96,6 +99,7 @@ class ArrayFactor(ScalarTerm):
         return len(np.unique(which, axis=0))
 
 
+@checked
 class StationBeam(JonesTerm):
     """A phased station, horizon to feed, (T, F, A, S, 2, 2): `ArrayFactor` times the element's pattern."""
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import model_validator
 
+from instrument.checked import checked
 from instrument.errors import InputError
 from instrument.jones.base import Basis, JonesTerm
 from instrument.jones.lookup import between, demand_within, nearest
@@ -17,6 +18,7 @@ Matrices = Annotated[Any, ArrayOf(complex, (None, None, None, 2, 2))]
 Axis = Annotated[Any, ArrayOf(float, (None,))]
 
 
+@checked
 class JonesTable(JonesTerm):
     """Jones matrices of each station, complex (T, F, A, 1, 2, 2), from `values` (t, f, A, 2, 2) on their own grid.
 

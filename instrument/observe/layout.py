@@ -9,6 +9,7 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import model_validator
 
+from instrument.checked import checked
 from instrument.component import Component
 from instrument.errors import InputError, did_you_mean
 from instrument.units import ArrayOf, Float, Int, one_si, plain, to_si
@@ -21,6 +22,7 @@ GROUND_M = 6.34e6, 6.40e6
 UPRIGHT_RAD = np.deg2rad(10.0)
 
 
+@checked
 class Layout(Component):
     """Stations: names (A,), ITRF positions in m (A, 3), and local axes (A, 3, 3).
 

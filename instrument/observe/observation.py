@@ -7,6 +7,7 @@ from typing import Any, Self
 import numpy as np
 from pydantic import model_validator
 
+from instrument.checked import checked
 from instrument.component import Component
 from instrument.errors import InputError, RefusedError
 from instrument.memory import afford
@@ -18,6 +19,7 @@ MOST_TIMES = 3_000_000  # integrations that are planned at once, at 20 us and 1 
 SHORTEST_S = 1e-5  # MJD seconds of today resolve 1e-6 in double precision
 
 
+@checked
 class Observation(Component):
     """A phase centre tracked for `duration` in integrations of `interval`, at channel centres `frequencies`.
 

@@ -8,6 +8,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from instrument.checked import checked
 from instrument.component import Component
 from instrument.jones.chain import Chain
 from instrument.observe.sampling import Sampling
@@ -57,6 +58,7 @@ class Problem:
         return self.at.shape[0], self.at.shape[1], len(self.antenna1)
 
 
+@checked
 class Predictor(Component):
     """An engine: says what it refuses and what a problem costs, and computes V_ab = sum_s J_a B J_b^H K_ab."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from typing import TYPE_CHECKING, ClassVar
 
+from instrument.checked import checked
 from instrument.component import Component
 from instrument.observe.sampling import Sampling
 from instrument.units import Complex, Direction, Float
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from instrument.sky.points import PointSky
 
 
+@checked
 class Sky(Component):
     """Sources on the sky: directions (S,) and brightness matrices (T, F, S, 2, 2), length 1 where constant.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Annotated, Any, Self
@@ -9,6 +10,7 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import model_validator
 
+from instrument.checked import checked
 from instrument.errors import InputError
 from instrument.jones.mueller import brightness
 from instrument.numbers import Whole
@@ -29,6 +31,7 @@ OPTIONAL = (
 PER_SOURCE = ("ra_rad", "dec_rad", "stokes_jy", *OPTIONAL)
 
 
+@checked
 class PointSky(Sky):
     """S sources: Stokes I, Q, U, V (S, 4) in Jy at `reference_hz`, with spectra, rotation measures and Gaussian shapes.
 
@@ -93,7 +96,7 @@ class PointSky(Sky):
     @classmethod
     def read(
         cls,
-        path: Any,
+        path: str | os.PathLike[str],
         centre: Any = None,
         sizes: Any = None,
         beam: Any = None,

@@ -11,9 +11,11 @@ from instrument.errors import Outcome
 from instrument.foreground.base import ForegroundRemover, Separation
 from instrument.foreground.linear import leading, projection
 from instrument.observe.directions import LIGHT
-from instrument.units import Float, to_si
+from instrument.units import FINITE, Float, to_si
 
-Depth = Annotated[float, BeforeValidator(lambda x: to_si(x, "rad/m2", "depth") if hasattr(x, "unit") else x)]
+Depth = Annotated[
+    float, BeforeValidator(lambda x: to_si(x, "rad/m2", "depth") if hasattr(x, "unit") else FINITE.check(x, "depth"))
+]
 
 
 class FaradayFilter(ForegroundRemover):

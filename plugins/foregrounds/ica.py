@@ -12,7 +12,7 @@ from pydantic import Field
 from instrument.errors import Outcome, PluginError
 from instrument.foreground.base import ForegroundRemover, Separation
 from instrument.foreground.linear import projection, seen
-from instrument.units import Float
+from instrument.units import Float, Seed
 
 
 class FastICA(ForegroundRemover):
@@ -23,7 +23,7 @@ class FastICA(ForegroundRemover):
 
     components: Annotated[int, Field(ge=0)] = 4
     iterations: Annotated[int, Field(ge=1)] = 200
-    seed: int = 0
+    seed: Seed = 0
 
     def separate(self, maps: Any, freq_hz: Float) -> Separation:
         """Foreground A A^+ (X - mean) + mean; raises `PluginError` where scikit-learn is not installed."""

@@ -23,7 +23,7 @@ HEAVY = {"astropy", "scipy", "numba", "matplotlib", "ducc0", "h5py", "jinja2", "
 LAYERS = (
     ("errors", "data", "scenes"),
     ("numbers", "run_folder", "compiled", "terminal", "whole_file"),
-    ("units",),
+    ("units", "checked"),
     ("files_in", "memory"),
     ("registry", "mat2", "phasor", "scene_text"),
     ("component",),

@@ -182,7 +182,9 @@ def test_the_fine_screens_leak_7_mk_with_the_eigenvalues_they_are_known_by():
 
 @pytest.mark.parametrize("given", [{"fraction": np.nan}, {"radius": 0 * u.deg}, {"frequency": -1 * u.Hz}])
 def test_impossible_leakage_is_refused(given):
-    with pytest.raises(InputError, match="the first must be finite, the others above 0"):
+    with pytest.raises(
+        InputError, match=r"must be a finite number|must be above 0|the first must be finite, the others above 0"
+    ):
         leaked(flat((1, 0)), **given)
 
 

@@ -1,7 +1,5 @@
 """PointSky against closed forms: spectra, Faraday rotation, Gaussian shapes, selections, and what it refuses."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from astropy import units as u
@@ -9,6 +7,7 @@ from astropy.coordinates import SkyCoord
 
 from instrument.errors import InputError
 from instrument.observe.directions import LIGHT, lmn, offset
+from instrument.observe.sampling import Sampling
 from instrument.sky.points import FWHM_TO_SIGMA, PointSky
 from instrument.units import Direction, unit_vectors
 
@@ -27,8 +26,15 @@ def gaussian(fwhm_a, fwhm_b, angle, l=0.0, m=0.0):
     return one(ra_rad=ra, dec_rad=dec, major_rad=[fwhm_a], minor_rad=[fwhm_b], angle_rad=[angle])
 
 
+def where(**known):
+    """A Sampling of which only some things are known."""
+    at = object.__new__(Sampling)
+    at.__dict__.update(known)
+    return at
+
+
 def seen(sky, uvw):
-    return sky.envelope(SimpleNamespace(centre=CENTRE), np.asarray(uvw, float)[None, None])[0, 0]
+    return sky.envelope(where(centre=CENTRE), np.asarray(uvw, float)[None, None])[0, 0]
 
 
 def test_logarithmic_terms_follow_their_formula():
@@ -121,11 +127,11 @@ def test_the_envelope_is_the_fourier_integral_of_the_brightness(l, m):
 
 
 def test_points_have_no_envelope():
-    assert one().envelope(SimpleNamespace(centre=CENTRE), np.ones((1, 1, 1, 3))) is None
+    assert one().envelope(where(centre=CENTRE), np.ones((1, 1, 1, 3))) is None
 
 
 def test_brightness_matrices_are_those_of_the_stokes_parameters():
-    matrix = one(stokes_jy=[[2.0, 0.3, -0.4, 0.1]]).brightness(SimpleNamespace(freq_hz=np.array([1e8])))[0, 0, 0]
+    matrix = one(stokes_jy=[[2.0, 0.3, -0.4, 0.1]]).brightness(where(freq_hz=np.array([1e8])))[0, 0, 0]
     np.testing.assert_allclose(matrix, [[2.3, -0.4 + 0.1j], [-0.4 - 0.1j, 1.7]], rtol=1e-15)
 
 

@@ -145,7 +145,7 @@ def test_an_unknown_setting_of_a_plugin_is_an_input_error():
 
 
 def test_a_name_that_is_not_text_is_refused():
-    with pytest.raises(InputError, match="a plugin is loaded by its name, got 3"):
+    with pytest.raises(InputError, match="name = 3 must be text"):
         instrument.load("engines", 3)
 
 

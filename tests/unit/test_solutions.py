@@ -142,7 +142,7 @@ def test_one_matrix_for_all_stations_is_written_for_each(tmp_path, vis):
         ("diagonal", "full", "pattern 'diagonal' would lose entries of up to .*; use 'full'"),
         ("scalar", "diagonal", "pattern 'scalar' would lose"),
         ("phase", "diagonal", "pattern 'phase' would lose"),
-        ("diag", "full", "no pattern 'diag': did you mean 'diagonal'"),
+        ("diag", "full", "pattern = 'diag' is not one of .*: did you mean 'diagonal'"),
     ],
 )
 def test_a_pattern_that_loses_something_is_refused(tmp_path, pattern, given, message):
@@ -238,7 +238,7 @@ def test_a_layout_orders_the_stations_and_misses_none_silently(path, vis):
     strangers = instrument.load("telescopes", "lofar-hba", stations=["RS509HBA", "RS205HBA"]).layout()
     with pytest.raises(FileError, match="no station 'RS509HBA' and 1 more"):
         read_h5parm(path, layout=strangers, missing="flag")
-    with pytest.raises(InputError, match="missing = 'skip' must be 'error' or 'flag'"):
+    with pytest.raises(InputError, match="missing = 'skip' is not one of 'error', 'flag'"):
         read_h5parm(path, missing="skip")
 
 
