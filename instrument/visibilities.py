@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from instrument import mat2
+from instrument.checked import checked
 from instrument.errors import BeamStateError, InputError, warn
 from instrument.jones import mueller
 from instrument.jones.base import JonesTerm
@@ -21,6 +22,7 @@ from instrument.observe.sampling import Sampling
 from instrument.units import POSITIVE, SEED, Bool, Complex, Direction, Float, Int, one_si, plain
 
 
+@checked
 @dataclass(frozen=True)
 class BeamState:
     """What has been taken out of visibilities: "nothing" or "centre" (the beam), and towards where.
@@ -69,6 +71,7 @@ def _no_flags() -> Bool:
     return np.zeros((1, 1, 1), bool)
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Visibilities:
     """Visibilities in Jy, complex (T, F, B, 2, 2): rows are receptors p, q of the first station, columns of the second.

@@ -12,6 +12,7 @@ from instrument.calibrate.als import LANES
 from instrument.calibrate.base import Calibrator, Solution, by_baseline, other_length, pair
 from instrument.calibrate.chunk import Cell, Job
 from instrument.calibrate.gauge import gauge_of
+from instrument.checked import checked
 from instrument.errors import InputError
 from instrument.jones.base import JonesTerm
 from instrument.jones.table import JonesTable
@@ -20,6 +21,7 @@ from instrument.units import Bool, Count, Float, Metres, PositiveSeconds, Real
 from instrument.visibilities import Visibilities
 
 
+@checked
 class SelfCal(Calibrator):
     """Direction-independent solve of V_ab = J_a M_ab J_b^H, per `interval` (each integration by default) and channel.
 

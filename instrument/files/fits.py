@@ -11,6 +11,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+from instrument.checked import checked
 from instrument.errors import FileError, InputError, unused, warn
 from instrument.files.fits_axes import Role
 from instrument.files.fits_header import Given, Part, affordable, look
@@ -23,6 +24,7 @@ NAMES = "IQUV"
 MFS = re.compile(r"(.*)-MFS(-.*)")  # WSClean: the mean of all channels, beside NAME-0000, NAME-0001, ...
 
 
+@checked
 def read_cube(
     *paths: str | os.PathLike[str],
     stokes: str | Sequence[str] | None = None,

@@ -8,17 +8,19 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from instrument.checked import checked
 from instrument.errors import InputError
 from instrument.image.channels import channel_index, in_band
 from instrument.image.cube_file import write_cube
 from instrument.observe.directions import LIGHT
-from instrument.units import Direction, Float, to_si
+from instrument.units import Count, Direction, Float, to_si
 
 BOLTZMANN = 1.380649e-23  # J/K
 JY = 1e-26  # W m^-2 Hz^-1
 Unit = Literal["Jy/beam", "Jy/pixel", "K"]
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Psf:
     """Point spread function (F, Ny, Nx), peak 1 at the centre pixel, and the Gaussian fitted to its main lobe.
@@ -48,7 +50,7 @@ class Psf:
         a, b, pa = np.broadcast_arrays(*(np.atleast_1d(np.asarray(x, float)) for x in (*widths, turned)))
         return cls(None, a, b, pa, np.zeros(len(a)))
 
-    def of(self, channels: int) -> Psf:
+    def of(self, channels: Count) -> Psf:
         """The same for so many channels: one beam becomes that of all; raises `InputError` for any other number."""
         given = {len(x) for x in (self.major_rad, self.minor_rad, self.angle_rad, self.residual)}
         given |= set() if self.data is None else {len(self.data)}
@@ -66,6 +68,7 @@ class Psf:
         return np.pi / (4 * np.log(2)) * self.major_rad * self.minor_rad
 
 
+@checked
 @dataclass(frozen=True, eq=False, init=False)
 class StokesCube:
     """Stokes I, Q, U, V images, real (F, 4, Ny, Nx); x runs to the west, y to the north; NaN is no data.

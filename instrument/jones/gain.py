@@ -9,16 +9,18 @@ import numpy as np
 from pydantic import model_validator
 
 from instrument import mat2
+from instrument.checked import checked
 from instrument.errors import InputError
 from instrument.jones.base import Basis, JonesTerm, Simplified, Structure
 from instrument.jones.lookup import demand_within, nearest
 from instrument.observe.sampling import Sampling
-from instrument.units import ArrayOf, Complex, Float, Real, Seed
+from instrument.units import ArrayOf, Complex, Float, NotNegative, Real, Seed
 
 Table = Annotated[Any, ArrayOf(complex, (None, None, None, 2))]
 Axis = Annotated[Any, ArrayOf(float, (None,))]
 
 
+@checked
 class StationTable(JonesTerm):
     """Two complex numbers per station, (T, F, A, 2): `values`, plus errors of rms `rms` drawn anew for every time.
 
@@ -73,12 +75,13 @@ class StationTable(JonesTerm):
             out = out + self.rms * drawn[:, None]
         return out
 
-    def simplify(self, at: Sampling, tolerance: float) -> Simplified:
+    def simplify(self, at: Sampling, tolerance: NotNegative) -> Simplified:
         """Leaves the term out when it is exactly the identity."""
         plain = self.values is None or np.all(self.values == self.neutral)
         return Simplified(None, "identity", 0.0) if plain and not self.rms else Simplified(self, "", 0.0)
 
 
+@checked
 class GainTerm(StationTable):
     """Gains of each station, diag(g_p, g_q), complex (T, F, A, 1, 2, 2)."""
 

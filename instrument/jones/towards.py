@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from instrument.checked import checked
 from instrument.component import Component
 from instrument.jones.base import Basis, JonesTerm
 from instrument.jones.chain import Chain
@@ -17,6 +18,7 @@ from instrument.observe.sampling import Sampling
 from instrument.units import Complex, SkyDirection
 
 
+@checked
 class Towards(JonesTerm):
     """Jones matrices of `chain` towards one direction (the phase centre by default), (T, F, A, 1, 2, 2)."""
 

@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from instrument.checked import checked
 from instrument.errors import InputError
 from instrument.observe.directions import EarthFrame, earth_frame, lmn, tangents
 from instrument.observe.layout import Layout
-from instrument.units import Direction, Float, plain, unit_vectors
+from instrument.units import Direction, Float, instants, plain, unit_vectors
 
 
 class Rising(NamedTuple):
@@ -47,10 +48,12 @@ class Sampling:
     seen_centre: Float | None = None
 
     @classmethod
+    @checked
     def build(
         cls, layout: Layout, times: Any, freq_hz: Float, ra_rad: Float, dec_rad: Float, centre: Direction
     ) -> Sampling:
         """Sampling at astropy `times` (T,), for ICRS directions (S,) in rad; all finite, frequencies positive."""
+        times = instants(times)
         freq_hz = np.atleast_1d(plain(freq_hz, float, "freq_hz", finite=True))
         if np.any(freq_hz <= 0):
             raise InputError(f"freq_hz = {freq_hz.min():g} Hz must be positive")
@@ -69,6 +72,7 @@ class Sampling:
         """(T, F, A, S)."""
         return len(self.earth), len(self.freq_hz), len(self.layout), len(self.ra_rad)
 
+    @checked
     def block(self, times: slice, channels: slice) -> Sampling:
         """The same for some times and channels."""
         return replace(
@@ -81,6 +85,7 @@ class Sampling:
             seen_centre=None if self.seen_centre is None else self.seen_centre[times],
         )
 
+    @checked
     def towards(self, ra_rad: Float, dec_rad: Float) -> Sampling:
         """The same for other directions, ICRS rad (S,)."""
         return replace(self, ra_rad=np.atleast_1d(ra_rad), dec_rad=np.atleast_1d(dec_rad), seen=None, seen_east=None)

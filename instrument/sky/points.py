@@ -144,12 +144,12 @@ class PointSky(Sky):
         cls, directions: Any, stokes_jy: Any, frequency: Any = None, names: Sequence[str] | None = None, **fields: Any
     ) -> PointSky:
         """Sources at a SkyCoord (S,) with Stokes parameters (S, 4), or Stokes I alone (S,); plain numbers are Jy."""
-        from instrument.units import icrs_of, to_si
+        from instrument.units import icrs_of, plain, to_si
 
         icrs = icrs_of(directions)
         ra, dec = np.atleast_1d(icrs.ra.rad).ravel(), np.atleast_1d(icrs.dec.rad).ravel()
         given_unit = hasattr(stokes_jy, "unit")
-        flux = np.asarray(to_si(stokes_jy, "Jy", "stokes_jy") if given_unit else stokes_jy, float)
+        flux = np.asarray(to_si(stokes_jy, "Jy", "stokes_jy") if given_unit else plain(stokes_jy, float, "stokes_jy"))
         if flux.ndim < 2 and not (flux.ndim == 1 and len(ra) == 1 and flux.size == 4):
             flux = np.atleast_1d(flux)[:, None] * np.array([1.0, 0.0, 0.0, 0.0])
         flux = np.atleast_2d(flux)
