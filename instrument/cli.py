@@ -55,7 +55,8 @@ def parser() -> argparse.ArgumentParser:
     scene_verb("plan", "Say what would be done, left out, and at what cost; nothing is computed.")
     _add_analyze(verbs)
     verbs.add_parser("scenes", help="List the shipped scenes.")
-    verbs.add_parser("plugins", help="List the plugins, and what is broken.")
+    plugins = verbs.add_parser("plugins", help="List the plugins, and what is broken; with a NAME its settings.")
+    plugins.add_argument("name", metavar="NAME", nargs="?", help="a plugin: its settings, their units and defaults")
     verbs.add_parser("doctor", help="Check this installation: versions, tables, threads, memory, a self-test.")
     return top
 
@@ -206,6 +207,11 @@ def _scenes(given: argparse.Namespace) -> int:
 def _plugins(given: argparse.Namespace) -> int:
     from instrument.registry import KINDS, available
 
+    if given.name is not None:
+        from instrument.plugin_settings import describe
+
+        show("\n".join(describe(given.name)))
+        return DONE
     for kind in KINDS:
         found = available(kind)
         show(f"{kind}" if found else f"{kind} (none)")
@@ -213,6 +219,7 @@ def _plugins(given: argparse.Namespace) -> int:
             show(
                 f"  {plugin.name:<18} {plugin.package:<14} {plugin.target}"
                 + (f"\n    BROKEN: {plugin.broken}" if plugin.broken else "")
+                + (f"\n    lacks {plugin.lacks}" if plugin.lacks else "")
             )
     return DONE
 

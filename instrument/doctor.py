@@ -6,8 +6,11 @@ import os
 import platform
 from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
 import numpy as np
+
+from instrument.run_folder import leftovers
 
 NEEDED = (
     "numpy",
@@ -49,6 +52,10 @@ def doctor(show: Callable[[str], None]) -> bool:
             if plugin.broken:
                 fine = False
                 show(f"BROKEN        {plugin.broken}")
+            if plugin.lacks:
+                show(f"optional      {plugin.name} lacks {plugin.lacks}")
+    for left in (left for folder in (".", "runs") for left in leftovers(Path(folder))):
+        show(f"left over     {left}: of a run that was killed; the next run there removes it")
     error = self_test()
     good = error < 1e-10
     verdict = "right" if good else "WRONG"

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
 from typing import Any
 
 from instrument.checked import checked
@@ -27,6 +28,7 @@ class Plugin:
     package: str
     target: str
     broken: str | None = None
+    lacks: str | None = None  # packages that it needs and that are not installed
 
 
 @cache
@@ -55,13 +57,22 @@ def available(kind: str) -> dict[str, Plugin]:
     """Every registered plugin of a kind, by name; a broken one says why and does not stop the rest."""
     listing = {}
     for name, points in sorted(_found(kind).items()):
-        broken = None
+        broken, lacks = None, ""
         try:
-            _resolve(kind, name)
+            lacks = _lacks(_resolve(kind, name))
         except PluginError as error:
             broken = str(error)
-        listing[name] = Plugin(kind, name, ", ".join(_package(p) for p in points), points[0].value, broken)
+        listing[name] = Plugin(
+            kind, name, ", ".join(_package(p) for p in points), points[0].value, broken, lacks or None
+        )
     return listing
+
+
+def _lacks(cls: Any) -> str:
+    """Packages that a plugin names in `needs` (module: package) and that cannot be found."""
+    needs: dict[str, str] = getattr(cls, "needs", {})
+    missing = [package for module, package in needs.items() if find_spec(module) is None]
+    return f"{', '.join(missing)}: pip install {' '.join(missing)}" if missing else ""
 
 
 def _resolve(kind: str, name: str) -> Any:

@@ -274,7 +274,12 @@ def _power_law(share: Float, low: float, high: float, slope: float) -> Float:
     a = 1 - slope
     if abs(a) < 1e-9:  # the limit of the power law below
         return np.asarray(high * (low / high) ** share)
-    return np.asarray((high**a + share * (low**a - high**a)) ** (1 / a))
+    with np.errstate(all="ignore"):
+        least, most = np.float64(low) ** a, np.float64(high) ** a
+        found = np.asarray((most + share * (least - most)) ** (1 / a))
+    if not (np.isfinite(found).all() and np.all(found > 0)):
+        raise InputError(f"slope = {slope:g} between {low:g} and {high:g} Jy cannot be drawn: take a flatter one")
+    return found
 
 
 def _vlssr_positions() -> tuple[Float, Float]:

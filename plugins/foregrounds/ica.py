@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -20,6 +20,8 @@ class FastICA(ForegroundRemover):
 
     They span what as many principal components of the maps less their means do: other maps, the same residual.
     """
+
+    needs: ClassVar[dict[str, str]] = {"sklearn": "scikit-learn"}
 
     components: Annotated[int, Field(ge=0)] = 4
     iterations: Annotated[int, Field(ge=1)] = 200

@@ -27,6 +27,7 @@ LAYERS = (
     ("files_in", "memory"),
     ("registry", "mat2", "phasor", "scene_text"),
     ("component",),
+    ("plugin_settings",),
     ("observe",),
     ("jones",),
     ("sky", "model"),
