@@ -17,6 +17,7 @@ from instrument.files.fits_axes import Role
 from instrument.files.fits_header import Given, Part, affordable, look
 from instrument.files.fits_open import opened
 from instrument.files_in import harmless
+from instrument.image.blanks import without_constants
 from instrument.image.cube import Psf, StokesCube, Unit
 from instrument.units import Float, to_si
 
@@ -187,7 +188,8 @@ def _filled(parts: list[Part], places: Places, freq: Float, psf: Psf | None) -> 
     if psf is None and np.isfinite(major).any():
         psf = Psf.gaussian(major * u.rad, minor * u.rad, angle * u.rad)
     grid = first.grid
-    return StokesCube(out, freq * u.Hz, grid.pixel_rad * u.rad, first.unit, grid.centre, psf)
+    out = without_constants(out, first.name + (f" and {len(parts) - 1} more" if len(parts) > 1 else ""), copy=False)
+    return StokesCube(out, freq * u.Hz, grid.pixel_rad * u.rad, first.unit, grid.centre, psf, "data")
 
 
 def _say(parts: list[Part]) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from instrument.checked import checked
 from instrument.errors import InputError
+from instrument.image.blanks import without_constants
 from instrument.image.channels import channel_index, in_band
 from instrument.image.cube_file import write_cube
 from instrument.observe.directions import LIGHT
@@ -74,7 +75,8 @@ class StokesCube:
     """Stokes I, Q, U, V images, real (F, 4, Ny, Nx); x runs to the west, y to the north; NaN is no data.
 
     `StokesCube(data=array, frequencies=freqs, pixel=0.5 * u.arcmin, unit="K")` makes one from anywhere. The centre is
-    pixel (Ny // 2, Nx // 2). Channels stay in the order given; `sorted()` puts them in order of frequency.
+    pixel (Ny // 2, Nx // 2). Channels stay in the order given; `sorted()` puts them in order of frequency. A channel
+    or a rim of one value (0, -999) is no data: it becomes NaN and is said, unless `constants` is "data".
     """
 
     data: Float
@@ -92,6 +94,7 @@ class StokesCube:
         unit: Unit = "Jy/beam",
         centre: Direction | None = None,
         psf: Psf | None = None,
+        constants: Literal["no data", "data"] = "no data",
     ) -> None:
         put = object.__setattr__
         cube = np.asarray(data)
@@ -107,7 +110,9 @@ class StokesCube:
             raise InputError(f"pixel = {pixel} is not finite and above 0")
         if unit not in get_args(Unit):
             raise InputError(f"unit = {unit!r} is not one of {', '.join(map(repr, get_args(Unit)))}: say which it is")
-        put(self, "data", cube)
+        if constants not in ("no data", "data"):
+            raise InputError(f"constants = {constants!r} is not 'no data' or 'data'")
+        put(self, "data", without_constants(cube) if constants == "no data" else cube)
         put(self, "freq_hz", freq)
         put(self, "pixel_rad", step)
         put(self, "unit", unit)
@@ -203,7 +208,8 @@ class StokesCube:
 
         given = {"data": self.data, "unit": self.unit, "centre": self.centre, "psf": self.psf, **changes}
         freq = given.pop("freq_hz", self.freq_hz)
-        return StokesCube(frequencies=freq * u.Hz, pixel=self.pixel_rad * u.rad, **given)
+        # what is one value here was looked at when the cube was made
+        return StokesCube(frequencies=freq * u.Hz, pixel=self.pixel_rad * u.rad, constants="data", **given)
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write a FITS cube in float32 (Stokes and frequency axes, IAU polarization, restoring beam), whole or not.
