@@ -12,6 +12,7 @@ from instrument.checked import checked
 from instrument.errors import InputError
 from instrument.image.blanks import without_constants
 from instrument.image.channels import channel_index, in_band
+from instrument.image.common_beam import at_common_beam
 from instrument.image.cube_file import write_cube
 from instrument.observe.directions import LIGHT
 from instrument.units import Count, Direction, Float, to_si
@@ -202,6 +203,19 @@ class StokesCube:
         if np.shape(data) != self.data.shape:
             raise InputError(f"data has shape {np.shape(data)}, needed that of the cube, {self.data.shape}")
         return self._with(data=data)
+
+    def with_psf(self, psf: Psf | None) -> StokesCube:
+        """The same images with another PSF, known better than by those who made them."""
+        return self._with(psf=psf)
+
+    def at_common_beam(self, size: Any = None) -> StokesCube:
+        """The same at one resolution in every channel: blurred to one Gaussian beam, Jy/beam of a point kept.
+
+        `size` is a width, three (major, minor, angle), text ("4 arcmin, 3 arcmin, 30 deg") or a `Psf` of one beam; the
+        largest beam of the cube unless given, or a circle around all where none holds the others. Pixels without data
+        stay so and weigh nothing. Raises `InputError` for channels with data and no beam, or with a larger one.
+        """
+        return at_common_beam(self, size)
 
     def _with(self, **changes: Any) -> StokesCube:
         from astropy import units as u
