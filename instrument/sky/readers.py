@@ -25,6 +25,7 @@ from instrument.sky.text_tables import text_table
 from instrument.units import Direction, Hertz, Radians, SkyDirection
 
 BBS_SUFFIXES = (".skymodel", ".sky", ".bbs")
+CARRIED_TABLES = ("mock_150mhz.csv",)  # the other tables of the package are no skies
 CATALOGUE_BYTES = 200_000_000  # NVSS has 1.8 million sources in 180 MB; whole surveys beyond that are to be cut
 
 
@@ -104,7 +105,8 @@ def _find(path: Any) -> Path:
                 "as a table of named columns"
             )
         return file
-    carried = {f.name: f for f in files("instrument.data").iterdir() if f.name.endswith((".skymodel", ".csv"))}
+    there = files("instrument.data").iterdir()
+    carried = {f.name: f for f in there if f.name.endswith(".skymodel") or f.name in CARRIED_TABLES}
     if len(file.parts) == 1 and file.name in carried:
         return Path(str(carried[file.name]))
     near = did_you_mean(harmless(file.name, 60), carried)

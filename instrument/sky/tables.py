@@ -136,6 +136,12 @@ def number_of(text: str) -> float | None:
 
 def entry(path: Path, column: Column, row: int, text: str, where: int, kind: str, hours: bool) -> float:
     """A number, NaN where there is none (what stands there is kept); sexagesimal text in degrees."""
+    try:  # nearly every entry is a plain number
+        plain = float(text)
+    except ValueError:
+        plain = np.nan
+    if -np.inf < plain < np.inf and "_" not in text:
+        return plain
     if text.lower() in NOTHING:
         column.missing[row] = "empty" if text.lower() != "nan" else f"{text}, which is not finite"
         return float("nan")

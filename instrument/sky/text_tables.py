@@ -93,8 +93,8 @@ def _delimiter(line: str) -> str:
 def _splitter(path: Path, delimiter: str) -> Callable[[int, str], list[str]]:
     def split(number: int, line: str) -> list[str]:
         try:
-            if delimiter == " " and '"' not in line:
-                return line.split()
+            if '"' not in line and "\0" not in line:
+                return line.split() if delimiter == " " else line.split(delimiter)
             return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True, strict=True))
         except (csv.Error, StopIteration) as error:  # a NUL, a field of more than 128 kB
             raise broken(path, number, f"not a row of a table: {error or 'nothing in it'}") from None
