@@ -8,11 +8,13 @@ preconditioner of the conjugate gradients that solve the whole.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from instrument.calibrate.fit import Left, strange
 from instrument.calibrate.gauge import UNKNOWNS
+from instrument.calibrate.graph import counted, tied
 from instrument.errors import Outcome
 from instrument.units import Bool, Complex, Float, Int
 
@@ -106,13 +108,16 @@ class Block:
             z, left = self._seen(x)
             if turn >= HELD and not history[-1] > limits.tolerance:
                 break
-        rest = self._share(left)
-        if not np.isfinite(history[-1]) or self._singular(x):
+        # interference that the weights have put aside is no misfit
+        rest = self._share(left, self._weight(left))
+        if not np.isfinite(history[-1]) or self._singular(x) or self._loose():
             outcome = Outcome.SINGULAR
         elif history[-1] > limits.tolerance:
             outcome = Outcome.ITERATION_LIMIT
+        elif not np.nanmax(rest) <= limits.unexplained or self._odd(left):
+            outcome = Outcome.POOR_FIT
         else:
-            outcome = Outcome.CONVERGED if np.nanmax(rest) <= limits.unexplained else Outcome.POOR_FIT
+            outcome = Outcome.CONVERGED
         found = np.where(live, x, np.nan).transpose(2, 0, 1, 3)
         return found, outcome, len(history), rest, np.array(history)
 
@@ -164,10 +169,46 @@ class Block:
         variance = max(float(np.median(chi2[used])) / MEDIAN_CHI2_8 / taken, floor, 1e-300)
         return (freedom + 8) / (freedom + chi2 / variance)
 
-    def _share(self, left: Complex) -> Float:
-        one, whole = ((self.w * _power(x)).sum(axis=(1, 2, 3)) for x in (left, self.v))
+    def _share(self, left: Complex, weight: Float) -> Float:
+        one, whole = ((weight * _power(x)).sum(axis=(1, 2, 3)) for x in (left, self.v))
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.sqrt(one / whole)
+
+    def _odd(self, left: Complex) -> bool:
+        """Whether some baselines, or most of what a station has, do not agree with the fit."""
+        weight = self._weight(left)
+        rest, data, fit = (
+            (weight * _power(x)).sum(axis=(0, 3))[None, self.a1, self.a2] for x in (left, self.v, self.v - left)
+        )
+        samples = (self.w > 0).sum(axis=(0, 3))[None, self.a1, self.a2]
+        seen, limits = Left(rest, data, fit, samples), self.limits
+        sets = self.column.shape[1]
+        if strange(seen, self.a1, self.a2, self.stations, limits.tolerance, limits.pattern, sets).any():
+            return True
+        if limits.robust is None:
+            return bool(seen.few_fit(limits.unexplained).any())
+        aside = ((weight < 0.1 * self.w) & (self.w > 0)).sum(axis=(0, 2, 3))
+        return bool(np.any(aside > 0.5 * (self.w > 0).sum(axis=(0, 2, 3)), where=self.active.any(axis=0)))
+
+    def suspects(self, jones: Complex) -> Bool:
+        """Samples (P, s, B) that a solve with robust weights puts aside, if they are few; none otherwise."""
+        limits = replace(self.limits, robust=2.0, tolerance=max(self.limits.tolerance, 1e-5))
+        found = replace(self, limits=limits)
+        x = found.solve(jones)[0].transpose(1, 2, 0, 3)
+        left = found._seen(np.where(np.isfinite(x), x, 0.0))[1]
+        aside = (found._weight(left) < 0.05 * self.w).transpose(0, 3, 1, 2)[..., self.a1, self.a2]
+        return aside if aside.sum() <= max(1, 0.1 * (self.weight > 0).sum()) else np.zeros_like(aside)
+
+    def _loose(self) -> bool:
+        """Whether the baselines that count leave stations apart, or in two groups, for one of the unknowns."""
+        power = np.einsum("psb,cpsbij->cpbij", self.weight, np.abs(self.models) ** 2)
+        for k, active in enumerate(self.active):
+            here = np.einsum("pc,cpbij->bij", self.column == k, power)[None]
+            alive = (active[self.a1] & active[self.a2])[None, :, None, None]
+            held = tied(counted(here * alive), self.a1, self.a2, self.stations, self.limits.pattern)[0]
+            if np.any(active & ~held):
+                return True
+        return False
 
     def _singular(self, x: Complex) -> bool:
         """Whether clusters are alike: as models to the array (then their matrices mix), or corrupted to a station."""

@@ -10,16 +10,16 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator
 
-from instrument.calibrate.base import Calibrator, Solution, pair
+from instrument.calibrate.base import Calibrator, Solution, by_baseline, pair
 from instrument.calibrate.clusters import Block, Limits
 from instrument.calibrate.gauge import gauge_of
 from instrument.checked import checked
 from instrument.errors import InputError, InstrumentError, Outcome, did_you_mean
 from instrument.jones.base import JonesTerm
 from instrument.jones.table import JonesTable
-from instrument.units import Complex, Float, Int, Metres, PositiveSeconds, to_si
+from instrument.units import Bool, Complex, Count, Float, Int, Metres, Positive, PositiveSeconds, Real, to_si
 from instrument.visibilities import Visibilities
 
 Models = Mapping[str, Visibilities]
@@ -106,12 +106,12 @@ class DirectionalCal(Calibrator):
     pattern: Literal["full", "diagonal", "scalar", "phase"] = "full"
     interval: PositiveSeconds | None = None
     intervals: Annotated[dict[str, str], BeforeValidator(_seconds_by_name)] = {}  # noqa: RUF012 - pydantic copies it
-    channels: Annotated[int, Field(ge=1)] = 1
-    robust: Annotated[float | None, Field(gt=0)] = None
-    tolerance: Annotated[float, Field(gt=0, lt=0.1)] = 1e-8
-    iterations: Annotated[int, Field(ge=1)] = 100
+    channels: Count = 1
+    robust: Positive | None = None
+    tolerance: Annotated[float, Real(above=0, below=0.1)] = 1e-8
+    iterations: Count = 100
     min_baseline: Metres | None = None
-    unexplained: Annotated[float, Field(gt=0, le=1)] = 0.7
+    unexplained: Annotated[float, Real(above=0, at_most=1)] = 0.7
     start: JonesTerm | None = None
 
     def solve(self, data: Visibilities, models: Models) -> DirectionalSolution:  # type: ignore[override]
@@ -128,7 +128,8 @@ class DirectionalCal(Calibrator):
         if self.channels > data.data.shape[1]:
             raise InputError(f"channels = {self.channels} of one solution, but the data have {data.data.shape[1]}")
         cells = [(int(k), f) for k in grid.blocks for f in range(0, data.data.shape[1], self.channels)]
-        job = _Job(self, data, stacked, weight, grid)
+        scale = [_near(x) for x in (data.data[..., None], stacked[..., None], weight)]
+        job = _Job(self, data, stacked, weight, grid, scale)
         from threadpoolctl import threadpool_limits
 
         with threadpool_limits(1), ThreadPoolExecutor(os.cpu_count() or 1) as pool:
@@ -206,6 +207,7 @@ class _Part:
     history: Float
     column: Int  # (P, C): the unknown that a cluster has in a piece
     pieces: Int  # (P, C): the interval of the cluster that it belongs to
+    suspects: list[tuple[Int, slice, Bool]]  # times, channels and which visibilities of them stand out
 
 
 @dataclass
@@ -217,6 +219,7 @@ class _Job:
     models: Complex
     weight: Float
     grid: _Grid
+    scale: list[float]  # of data, models and weights: what 1e170 Jy are divided by, since its square is infinite
 
     def solve(self, block: int, channel: int) -> _Part:
         """Solve one block of integrations, and `channels` channels from `channel` on."""
@@ -236,15 +239,26 @@ class _Job:
         models = np.stack([_even([m[t, span] for t in chosen]) for m in self.models])
         finite = bool(np.isfinite(models[:, weight > 0]).all())
         weight = weight if finite else np.zeros_like(weight)
+        of_data, of_models, of_weight = self.scale
+        root = math.sqrt(of_data) / math.sqrt(of_models)
+        with np.errstate(invalid="ignore"):  # data may hold infinities
+            data = _even([self.data.data[t, span] for t in chosen]) / of_data
         solver = Block(
-            data=_even([self.data.data[t, span] for t in chosen]), models=np.where(np.isfinite(models), models, 0.0),
-            weight=weight, a1=self.data.antenna1, a2=self.data.antenna2, stations=len(self.data.layout),
+            data=data,
+            models=np.asarray(np.where(np.isfinite(models), models, 0.0) / of_models, complex),
+            weight=weight / of_weight, a1=self.data.antenna1, a2=self.data.antenna2, stations=len(self.data.layout),
             column=column, limits=limits,
         )  # fmt: skip
-        jones, outcome, count, share, history = solver.solve(self._start(rows[:1], span, solver.columns))
+        begin = self._start(rows[:1], span, solver.columns)
+        jones, outcome, count, share, history = solver.solve(begin)
+        suspects: list[tuple[Int, slice, Bool]] = []
+        if outcome is Outcome.POOR_FIT and s.robust is None:
+            shape = (-1, span.stop - span.start, weight.shape[2])
+            for t, mask in zip(chosen, solver.suspects(begin), strict=True):
+                suspects.append((t, span, mask.reshape(shape)[: len(t)]))
         alive = [Outcome.REFUSED if finite else Outcome.NON_FINITE, outcome]
         outcomes = [alive[int(row.any())] for row in solver.active]
-        return _Part((block, channel), jones, outcomes, count, share, history, column, first)
+        return _Part((block, channel), jones * root, outcomes, count, share, history, column, first, suspects)
 
     def _start(self, row: Int, span: slice, columns: int) -> Complex:
         begin = np.zeros((columns, len(self.data.layout), 2, 2), complex)
@@ -277,6 +291,9 @@ class _Job:
                     jones[t, f] = part.jones[k]
         longest = max(len(p.history) for p in parts)
         history = np.stack([np.pad(p.history, (0, longest - len(p.history))) for p in parts]).max(axis=0)
+        suspects = np.zeros(data.data.shape[:3], bool)
+        for times, span, mask in (found for p in parts for found in p.suspects):
+            suspects[times, span] |= mask
         return Solution(
             term=JonesTable(
                 values=jones,
@@ -290,6 +307,9 @@ class _Job:
             gauge=gauge_of(self.models[cluster], self.weight, settings.pattern),
             history=history,
             interval_s=self.grid.steps[cluster] * data.interval_s,
+            suspects=suspects,
+            spoilt=by_baseline(suspects, data),
+            unexplained=share,
         )
 
 
@@ -300,3 +320,10 @@ def _even(pieces: list[Any]) -> Any:
     for row, x in zip(out, flat, strict=True):
         row[: len(x)] = x
     return out
+
+
+def _near(values: Any) -> float:
+    """A power of four by which values are divided to be near 1; 1.0 where their squares are no trouble."""
+    size = np.abs(values.view(float) if np.iscomplexobj(values) else values)
+    power = int(np.frexp(size.max(initial=0.0, where=np.isfinite(size)))[1]) // 2 * 2
+    return float(np.ldexp(1.0, power)) if abs(power) > 200 and power > -1000 else 1.0

@@ -74,8 +74,11 @@ class Left:
         return (self.usual > unexplained) & (self.usual > 1.5 * self.share)
 
 
-def strange(left: Left, a1: Int, a2: Int, stations: int, tolerance: float, pattern: str) -> Bool:
-    """Baselines (L, B) that a fit is wrong about though it stands still; whole stations with all of their baselines."""
+def strange(left: Left, a1: Int, a2: Int, stations: int, tolerance: float, pattern: str, sets: int = 1) -> Bool:
+    """Baselines (L, B) that a fit is wrong about though it stands still; whole stations with all of their baselines.
+
+    `sets` of matrices a station were solved for.
+    """
     use = (left.samples > 0) & (left.data > 0)
     # what a solve to this tolerance leaves is not noise
     small = left.rest <= min(100 * tolerance, 1e-3) ** 2 * left.data
@@ -86,12 +89,12 @@ def strange(left: Left, a1: Int, a2: Int, stations: int, tolerance: float, patte
     # most fits end here: no baseline has much more left over than others
     look = np.flatnonzero(np.nanmax(each, axis=1, initial=0.0) > FAR * _quantile(each, BETTER))
     if len(look):
-        out[look] = _looked(left[look], rest[look], use[look], a1, a2, stations, pattern)
+        out[look] = _looked(left[look], rest[look], use[look], a1, a2, stations, pattern, sets)
     return out
 
 
-def _looked(left: Left, rest: Float, use: Bool, a1: Int, a2: Int, stations: int, pattern: str) -> Bool:
-    free = 1 - taken(left.fit, a1, a2, stations, pattern) / np.maximum(left.samples, 1)
+def _looked(left: Left, rest: Float, use: Bool, a1: Int, a2: Int, stations: int, pattern: str, sets: int) -> Bool:
+    free = 1 - sets * taken(left.fit, a1, a2, stations, pattern) / np.maximum(left.samples, 1)
     measures = use & (free > FREE)
     with np.errstate(invalid="ignore", divide="ignore"):
         each = np.where(measures, rest / left.samples / free, np.nan)

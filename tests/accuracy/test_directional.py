@@ -228,7 +228,7 @@ def test_more_is_left_above_the_noise_by_a_solve_for_one_direction():
 
 
 def test_robust_weights_hold_against_interference():
-    """1 % of the visibilities with 100 Jy of interference: as good as without it, and 5 times better than plain."""
+    """1 % of the visibilities with 100 Jy of interference: as good as without it; a plain solve says what spoils it."""
     data, sky, jones = laboratory(slots=48)
     noisy = data.with_noise(SEFD, seed=11)
     rng = np.random.default_rng(5)
@@ -238,11 +238,14 @@ def test_robust_weights_hold_against_interference():
     clean, plain = settings.solve(noisy, sky), settings.solve(struck, sky)
     robust = settings.with_fields(robust=5).solve(struck, sky)
     robust.check()
-    assert plain["80 Jy"].converged.any()
+    # plain is some 5 times worse than robust, and no interval passes for right
+    assert not plain["80 Jy"].converged.any()
+    assert "stand out" in str(plain["80 Jy"])
+    again = settings.solve(struck.flagged(plain["80 Jy"].suspects), sky)
     for name, value in jones.items():
-        errors = [error_of(s[name], value, 6) for s in (clean, robust, plain)]
+        errors = [error_of(s[name], value, 6) for s in (clean, robust, again)]
         assert errors[1] < 1.15 * errors[0]
-        assert errors[1] < errors[2] / 5
+        assert errors[2] < 1.15 * errors[0]
 
 
 # Stiff and extreme -----------------------------------------------------------------------------------------------
