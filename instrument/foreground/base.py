@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from instrument.checked import checked
 from instrument.component import Component
@@ -44,7 +45,7 @@ class Separation:
     covariance: Float | None = None
 
     @classmethod
-    def nothing(cls, maps: Any, outcome: Outcome, remark: str) -> Separation:
+    def nothing(cls, maps: NDArray[Any], outcome: Outcome, remark: str) -> Separation:
         """No foreground at all: the residual is the data."""
         f = len(maps)
         none = np.zeros((0, *maps.shape[1:]), maps.dtype)

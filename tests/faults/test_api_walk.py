@@ -24,8 +24,9 @@ POISON = {"nan": math.nan, "inf": math.inf, "-1": -1, "0": 0, "'2'": "2", "True"
 CENTRE = SkyCoord("08h13m36.0s +48d13m03s")
 COUNTS = {"seed", "samples", "count", "bins", "bins_par", "workers", "components", "iterations", "nodes", "every"}
 COUNTS |= {"pixels", "rms", "tolerance", "channel", "indent"}
-# records of results, errors and enumerations: nobody gives them numbers from outside
+# errors, enumerations, and what only a subclass can be; a Direction is a plain tuple, checked wherever it is taken
 NOT_WALKED = {"Component", "InputError", "InstrumentError", "InstrumentWarning", "Outcome", "Simplified", "__version__"}
+NOT_WALKED |= {"Direction", "ScalarTerm", "Predictor"}
 # (what, argument, poison): why it is accepted
 MEANT: dict[tuple[str, str, str], str] = {
     ("ixr.leakage_of_ixr", "ixr_db", "inf"): "a perfect instrument leaks nothing",
@@ -67,6 +68,8 @@ class World:
         self.cylinders = self.analyzer.cylindrical()
         self.window = self.analyzer.eor_window(self.signal)
         self.remover = ins.load("foregrounds", "polynomial", terms=2)
+        self.loss = ins.signal_loss(self.remover, self.cube, self.cube, bins=4)
+        self.spheres, self.plane = self.analyzer.spherical(), self.analyzer.spectrum_2d()
         self.split = self.remover.split(self.cube)
         self.solution = ins.SelfCal().solve(self.vis, self.vis)
         self.leak = ins.Analyzer(visibilities=self.vis, sky=self.sky).leakage()
@@ -85,6 +88,7 @@ def calls():
     names, hba = ["CS001HBA0", "CS002HBA0"], {"stations": ["CS001HBA0", "CS002HBA0"]}
     times, freq = Time(["2012-12-07T23:00:00"]), [150] * u.MHz
     lofar = ins.load("telescopes", "lofar-hba", **hba)
+    station = next(t for t in lofar.chain().terms if isinstance(t, ins.StationBeam))
     beam = {"directions": CENTRE, "times": times, "frequencies": freq, "pointing": CENTRE}
     depths, eye = np.arange(-20.0, 21.0), np.eye(2)[None]
     out = [
@@ -124,7 +128,7 @@ def calls():
         ("Chain.peak", w.terms.peak, {"at": w.at}),
         ("Chain.simplified", w.terms.simplified, {"at": w.at, "tolerance": 0.0}),
         ("Chain.factors", w.terms.factors, {"at": w.at}),
-        ("StationBeam.jones", lofar.chain().terms[0].jones, {"at": lofar.sampling(**beam)}),
+        ("StationBeam.jones", station.jones, {"at": lofar.sampling(**beam)}),
         ("Towards.jones", ins.Towards(chain=lofar.chain()).jones, {"at": lofar.sampling(**beam)}),
         ("Instrument.beam", lofar.beam, {**beam, "state": "absolute"}),
         ("Instrument.mueller", lofar.mueller, {**beam, "baseline": tuple(names), "state": "differential"}),
@@ -153,6 +157,11 @@ def calls():
         ("read_h5parm", ins.read_h5parm, {
             "path": "none.h5", "layout": None, "direction": None, "solset": None, "soltabs": None, "missing": "error"}),
         ("write_h5parm", ins.write_h5parm, {"path": "out.h5", "solution": w.solution, "pattern": "full", "at": None}),
+        ("read_frequencies", ins.read_frequencies, {"path": "none.txt"}),
+        ("read_psf", ins.read_psf, {"path": "none.fits", "cube": w.cube}),
+        ("SignalLoss.within", w.loss.within, {"k_par": (0.0, 1.0), "k_perp": (0.0, 9.0)}),
+        ("Separation.nothing", ins.Separation.nothing, {
+            "maps": np.zeros((2, 3)), "outcome": ins.Outcome.REFUSED, "remark": "none"}),
         ("Imager.image", ins.Imager(pixels=16, pixel=8 * u.arcmin).image, {"visibilities": w.vis}),
         ("Imager.psf", ins.Imager(pixels=16, pixel=8 * u.arcmin).psf, {"visibilities": w.vis}),
         ("StokesCube", ins.StokesCube, {
@@ -243,17 +252,18 @@ def calls():
         ins.Imager(pixels=16, pixel="1 arcmin"),
         ins.GainTerm(),
     ]
-    things += [ins.FeedTerm(), ins.CubeAnalysis(), lofar.chain().terms[0], ins.load("skies", "grid"), w.remover]
+    things += [ins.FeedTerm(), ins.CubeAnalysis(), station, ins.load("skies", "grid"), w.remover]
     things += [
         ins.load("skies", "random", count=3),
         ins.load("skies", "faraday"),
         ins.load("elements", "dipole", height="0.5 m"),
     ]
     things += [ins.load("foregrounds", n) for n in ("gmca", "pca", "faraday-filter", "gpr")]
+    things += [*station.parts(), station.levels[0]]
     for thing in things:
         named = {info.alias or k: None for k, info in type(thing).model_fields.items()}
         out.append((type(thing).__name__, thing.with_fields, named))
-    for thing in (w.vis, w.leak, w.cylinders, w.window, w.signal, ins.BeamState()):
+    for thing in (w.vis, w.leak, w.cylinders, w.window, w.signal, w.spheres, w.plane, w.loss, ins.BeamState()):
         given = {f.name: getattr(thing, f.name) for f in fields(thing) if f.init}
         out.append((type(thing).__name__, type(thing), given))
     return out
