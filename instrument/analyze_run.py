@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -14,75 +16,148 @@ import numpy as np
 from instrument.cube_analysis import CubeAnalysis
 from instrument.cube_results import CubeResults
 from instrument.doctor import package_version
-from instrument.errors import InputError
+from instrument.errors import InputError, unused, unused_ledger
 from instrument.files.fits import read_cube
+from instrument.files.fits_psf import read_psf
+from instrument.files.number_list import read_frequencies, read_numbers
+from instrument.image.channels import channel_numbers, in_band
 from instrument.image.cube import Psf, StokesCube
 from instrument.report.progress import progress_bar
 from instrument.run_folder import RunFolder
 from instrument.run_record import PACKAGES, json_ready
+from instrument.units import Float
+
+OPTIONS = {  # what refusals ask for, as they do in Python and as it is written here
+    "frequencies=": "--frequencies FILE", "stokes=": "--stokes", "unit=": "--unit", "psf=": "--psf FILE or --beam",
+    "beam=": "--beam", "infill=": "--infill '300 ns'", "redshift=": "--redshift", "uv_range": "--uv-range",
+    "weights": "--weights FILE", "depths =": "--depths", "remove =": "--remove", "products =": "--products",
+    "channels=": "--flag-channels", "band =": "--band", "taper_space =": "--taper-space", "signal ": "--signal",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How files become a cube: what their headers do not say, which channels, which beam; words as of the command.
+
+    `frequencies` and `weights` are files of numbers, one a channel of the files, `psf` and `noise` are FITS files.
+    """
+
+    stokes: str | None = None
+    unit: Any = None
+    beam: str | None = None
+    frequencies: str | None = None
+    psf: str | None = None
+    flag_channels: str | None = None
+    band: str | None = None
+    common_beam: str | None = None
+    weights: str | None = None
+    noise: str | None = None
+
+    def cube(self, paths: Sequence[str]) -> tuple[StokesCube, Float | None]:
+        """The cube of the channels that are left, and their weights (F,)."""
+        freq = None if self.frequencies is None else read_frequencies(self.frequencies)
+        cube = read_cube(*paths, stokes=self.stokes, unit=self.unit, frequencies=freq)
+        count = len(cube.freq_hz)
+        if self.psf is not None:
+            if self.beam is not None:
+                raise InputError(f"--beam {self.beam} and --psf {self.psf}: give one of them")
+            cube = _with_psf(cube, read_psf(self.psf, cube))
+        elif self.beam is not None:
+            cube = _with_psf(cube, _beam(self.beam, cube))
+        weights = None if self.weights is None else read_numbers(self.weights, "weights of the channels")
+        if weights is not None and (len(weights) != count or (weights < 0).any()):
+            raise InputError(
+                f"--weights {self.weights} has {len(weights)} numbers from {weights.min():g} on: needed {count}, one "
+                "for each channel of the files, none below 0"
+            )
+        if self.flag_channels is not None:
+            cube = cube.flagged(channel_numbers(self.flag_channels, count, "--flag-channels"))
+        if self.band is not None:
+            inside = in_band(cube.freq_hz, self.band)
+            outside = np.flatnonzero(~inside)
+            unused("analyze", [f"channel {k}" for k in outside], f"outside of --band {self.band}")
+            cube, weights = cube.channels(inside), None if weights is None else weights[inside]
+        return cube, weights
+
+    def quiet(self, cube: StokesCube) -> StokesCube | None:
+        """The cube of noise, where one is named, of the same band; what its file does not say is as for the cube."""
+        if self.noise is None:
+            return None
+        alike = replace(self, beam=None, psf=None, weights=None, common_beam=None, flag_channels=None, noise=None)
+        try:
+            found, _ = replace(alike, stokes=None, unit=None, frequencies=None).cube([self.noise])
+        except InputError:
+            found, _ = alike.cube([self.noise])
+        return _with_psf(found, cube.psf) if found.psf is None and len(found.freq_hz) == len(cube.freq_hz) else found
 
 
 def analyze_files(
     paths: Sequence[str],
     settings: CubeAnalysis,
+    reading: Reading | None = None,
     out: str | None = None,
-    stokes: str | None = None,
-    unit: Any = None,
-    beam: str | None = None,
-    noise: str | None = None,
     command: str = "",
     show: Callable[[str], None] = lambda text: None,
 ) -> CubeResults:
     """Read cubes, analyze them and write a folder, whole or not at all; the results.
 
-    `beam` ("3 arcmin", or "4 arcmin, 3 arcmin, 30 deg") is that of all channels where the files name none; `noise` is
-    a file of noise alone. Raises `InputError` before anything is computed when files or settings will not do.
+    Raises `InputError` before anything is computed when files or settings will not do, with the option that helps.
     """
+    reading = reading or Reading()
     folder = RunFolder(Path(paths[0]).name.split(".fits")[0], out)
-    cube = _read(paths, stokes, unit, beam)
-    quiet = None if noise is None else _noise(noise, cube, stokes, unit)
-    settings.refusals(cube)
-    with folder, progress_bar(f"analyze {paths[0]}") as update:
-        result = settings.run(cube, quiet, update)
-        with result.timed("write"):
-            _write(result, paths, command, folder.partial)
-        path = folder.finish()
+    with unused_ledger() as ledger, _options():
+        cube, weights = reading.cube(paths)
+        quiet = reading.quiet(cube)
+        if weights is not None:
+            settings = settings.model_copy(update={"weights": tuple(float(w) for w in weights)})
+        settings.refusals(cube)
+        with folder, progress_bar(f"analyze {paths[0]}") as update:
+            result = settings.run(cube, quiet, update)
+            with result.timed("write"):
+                _write(result, paths, command, folder.partial, ledger)
+            path = folder.finish()
     spent = ", ".join(f"{name} {seconds:.1f}" for name, seconds in sorted(result.seconds.items(), key=lambda s: -s[1]))
     lines = [*result.lines_of_text(), "", f"time          {sum(result.seconds.values()):.1f} s ({spent})"]
     show("\n".join([*lines, f"written       {path}/report.html, run.json, tables and figures"]))
     return result
 
 
-def _read(paths: Sequence[str], stokes: str | None, unit: Any, beam: str | None) -> StokesCube:
-    cube = read_cube(*paths, stokes=stokes, unit=unit)
-    if beam is None:
-        return cube
+@contextmanager
+def _options() -> Iterator[None]:
+    """Names the option of the command beside what a refusal asks for in the words of Python."""
+    try:
+        yield
+    except InputError as error:
+        text = str(error)
+        named = [option for word, option in OPTIONS.items() if word in text and option.split()[0] not in text]
+        if not named:
+            raise
+        raise type(error)(f"{text} ({', '.join(named)})") from None
+
+
+def _beam(text: str, cube: StokesCube) -> Psf:
+    """The beam of `--beam`, of all channels; raises `InputError` where the files name theirs."""
     if cube.psf is not None:
-        raise InputError(f"--beam {beam}: the files name their beams; leave it out")
-    parts = [part.strip() for part in beam.split(",")]
+        raise InputError(f"--beam {text}: the files name their beams; leave it out")
+    parts = [part.strip() for part in text.split(",")]
     if not 1 <= len(parts) <= 3:
-        raise InputError(f"--beam {beam}: write it like '3 arcmin', or '4 arcmin, 3 arcmin, 30 deg'")
+        raise InputError(f"--beam {text}: write it like '3 arcmin', or '4 arcmin, 3 arcmin, 30 deg'")
+    try:
+        psf = Psf.gaussian(*parts).of(len(cube.freq_hz))
+    except InputError as error:
+        raise InputError(f"--beam {text}: {error}") from None
+    if not 0 < min(psf.major_rad[0], psf.minor_rad[0]) <= max(psf.major_rad[0], psf.minor_rad[0]) < np.pi:
+        raise InputError(f"--beam {text}: widths must be above 0 and finite, such as '3 arcmin'")
+    return psf
+
+
+def _with_psf(cube: StokesCube, psf: Psf | None) -> StokesCube:
     from astropy import units as u
 
-    psf = Psf.gaussian(*parts).of(len(cube.freq_hz))
-    if not 0 < min(psf.major_rad[0], psf.minor_rad[0]) <= max(psf.major_rad[0], psf.minor_rad[0]) < np.pi:
-        raise InputError(f"--beam {beam}: widths must be above 0 and finite, such as '3 arcmin'")
     return StokesCube(cube.data, cube.freq_hz * u.Hz, cube.pixel_rad * u.rad, cube.unit, cube.centre, psf)
 
 
-def _noise(path: str, cube: StokesCube, stokes: str | None, unit: Any) -> StokesCube:
-    """A cube of noise; what its file does not say is as for the cubes."""
-    try:
-        found = _read([path], None, None, None)
-    except InputError:
-        found = _read([path], stokes, unit, None)
-    from astropy import units as u
-
-    psf = cube.psf if found.psf is None and len(found.freq_hz) == len(cube.freq_hz) else found.psf
-    return StokesCube(found.data, found.freq_hz * u.Hz, found.pixel_rad * u.rad, found.unit, found.centre, psf)
-
-
-def _write(result: CubeResults, paths: Sequence[str], command: str, folder: Path) -> None:
+def _write(result: CubeResults, paths: Sequence[str], command: str, folder: Path, ledger: dict[str, list[str]]) -> None:
     from instrument.report.cube_page import cube_sections
     from instrument.report.page import write_page
     from instrument.report.run_page import page_of_run
@@ -97,6 +172,7 @@ def _write(result: CubeResults, paths: Sequence[str], command: str, folder: Path
         "command": command,
         "versions": {"python": platform.python_version(), **{p: package_version(p) for p in PACKAGES}},
         "machine": {"system": platform.platform()},
+        "unused": ledger,
         "seconds": {k: round(v, 3) for k, v in result.seconds.items()},
         **result.record(),
     }

@@ -74,7 +74,18 @@ def _add_analyze(verbs: Any) -> None:
     verb.add_argument(
         "--beam", metavar="SIZE", help="beam where the files name none: '3 arcmin', or major, minor, angle"
     )
-    verb.add_argument("--depths", metavar="A,B,STEP", help="Faraday depths in rad/m2 (default: -50,50,0.25)")
+    verb.add_argument(
+        "--frequencies", metavar="FILE", help="of the channels, in Hz, one a line, where no header has them"
+    )
+    verb.add_argument("--psf", metavar="PSF.fits", help="images of the PSF of the channels, or one for all")
+    verb.add_argument("--flag-channels", metavar="3,7-9", help="leave these channels out, counted from 0")
+    verb.add_argument("--band", metavar="A,B", help="take the channels in it, e.g. '134 MHz,166 MHz'")
+    verb.add_argument(
+        "--common-beam", metavar="SIZE", nargs="?", const="smallest", help="convolve all channels to one beam"
+    )
+    verb.add_argument("--depths", metavar="A,B[,STEP]", help="Faraday depths in rad/m2 (default: those of the band)")
+    verb.add_argument("--weights", metavar="FILE", help="of the channels in Faraday depth, one a line, e.g. 1/sigma^2")
+    verb.add_argument("--clean", action="store_true", help="RM-CLEAN down to 5 sigma before peaks are looked for")
     verb.add_argument("--uv-range", metavar="A,B", help="baselines of the spectra, wavelengths, e.g. 30,800")
     verb.add_argument("--taper", help="along frequency: blackman-harris (default), blackman-harris-7, hann, none")
     verb.add_argument("--taper-space", help="over the images: hann (default), blackman-harris, none")
@@ -155,7 +166,7 @@ def _run(given: argparse.Namespace) -> int:
 def _analyze(given: argparse.Namespace) -> int:
     import shlex
 
-    from instrument.analyze_run import analyze_files
+    from instrument.analyze_run import Reading, analyze_files
     from instrument.cube_analysis import CubeAnalysis
     from instrument.scene_text import override
 
@@ -169,7 +180,7 @@ def _analyze(given: argparse.Namespace) -> int:
     for setting in given.remover:
         if "=" not in setting:
             raise InputError(f"--remover {setting}: write it like --remover components=4")
-    if given.depths is not None and given.depths.count(",") != 2:
+    if given.depths is not None and given.depths.count(",") not in (1, 2):
         raise InputError(f"--depths {given.depths}: give the first, the last and the step, as -50,50,0.25")
     fields: dict[str, Any] = {
         "products": None if given.products is None else tuple(p.strip() for p in given.products.split(",")),
@@ -181,11 +192,10 @@ def _analyze(given: argparse.Namespace) -> int:
     for name in ("taper", "taper_space"):
         if (text := getattr(given, name)) is not None:
             fields[name] = None if text == "none" else text
-    settings = CubeAnalysis(remover=override({}, given.remover), cubes=given.cubes, **fields)
-    words = ["instrument", *given.words]
-    result = analyze_files(
-        given.files, settings, given.out, given.stokes, given.unit, given.beam, given.noise, shlex.join(words), show
-    )
+    settings = CubeAnalysis(remover=override({}, given.remover), cubes=given.cubes, clean=given.clean, **fields)
+    names = ("stokes", "unit", "beam", "frequencies", "psf", "flag_channels", "band", "common_beam", "weights", "noise")
+    reading = Reading(**{name: getattr(given, name) for name in names})
+    result = analyze_files(given.files, settings, reading, given.out, shlex.join(["instrument", *given.words]), show)
     return DONE if result.passed else FELL_SHORT
 
 

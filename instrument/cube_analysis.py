@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Annotated, Any, Literal, Self, get_args
 
 import numpy as np
@@ -12,56 +13,63 @@ from pydantic import Field, model_validator
 from instrument.analyze.analyzer import Analyzer
 from instrument.analyze.channel_grid import even_channels
 from instrument.analyze.cube_checks import check_cells, check_faraday
+from instrument.analyze.faraday_band import MOST, FaradayBand
 from instrument.analyze.fourier import Stokes, Taper
 from instrument.analyze.signal import DEFAULT, Signal21cm
 from instrument.checked import checked
 from instrument.component import Component
 from instrument.cube_results import CubeResults
-from instrument.errors import InputError, InstrumentWarning
+from instrument.errors import InputError, InstrumentWarning, unused, warn
 from instrument.foreground.base import ForegroundRemover
 from instrument.image.cube import StokesCube
 from instrument.registry import load
-from instrument.units import Float, Radians, Seconds
+from instrument.units import Count, Finite, Float, NotNegative, Positive, PositiveSeconds, Radians, Real, UvRange
 
 Product = Literal["faraday", "spectrum-2d", "cylindrical", "spherical", "window"]
 PRODUCTS: tuple[Product, ...] = get_args(Product)
-Share = Annotated[float, Field(ge=0, lt=1)]
+Removed = Annotated[float, Real(at_least=0, below=1)]
 MOST_DEPTHS = 20001
+DEFAULT_BYTES = 2 << 30  # of a Faraday cube whose depths nobody asked for
+CLEAN_SIGMAS = 5.0  # RM-CLEAN goes down to it
 
 
 @checked
 class CubeAnalysis(Component):
     """Which products of a cube, and their settings; without `products` all that the cube allows.
 
-    `depths` is the first, last and step of Faraday depth in rad/m²; `uv_range` in wavelengths; `taper` along frequency
+    `depths` is the first, last and step of Faraday depth in rad/m²; without the step, or without all, it is that of the
+    band (FWHM / 8, out to its largest depth). `weights` (F,) are those of the channels in Faraday depth; `clean` takes
+    peaks from spectra after RM-CLEAN. `uv_range` in wavelengths; `taper` along frequency
     and `taper_space` over the images; `remove` is a foreground remover by name with its settings in `remover`; `signal`
     the 21-cm model; `wedge` an angle from the phase centre; `removed` the share of leakage taken away in the figures.
     """
 
     products: tuple[Product, ...] | None = None
-    depths: tuple[float, float, float] = (-50.0, 50.0, 0.25)
-    uv_range: tuple[float, float] | None = None
+    depths: tuple[Finite, ...] | None = None
+    weights: tuple[NotNegative, ...] | None = None
+    clean: bool = False
+    uv_range: UvRange | None = None
     taper: Taper | None = "blackman-harris"
     taper_space: Taper | None = "hann"
-    bins: Annotated[int, Field(ge=1)] = 12
-    infill: Seconds | None = None
-    redshift: float | None = None
+    bins: Count = 12
+    infill: PositiveSeconds | None = None
+    redshift: Positive | None = None
     signal: str = DEFAULT
     wedge: Radians | None = None
-    removed: Share = 0.7
+    removed: Removed = 0.7
     remove: str | None = None
     remover: dict[str, Any] = Field(default_factory=dict)
     cubes: bool = False
 
     @model_validator(mode="after")
     def _can_be_done(self) -> Self:
-        first, last, step = self.depths
-        if not (np.isfinite(self.depths).all() and step > 0 and last > first):
-            raise InputError(f"depths = {list(self.depths)}: give the first, the last and a step above 0, in rad/m2")
-        if (last - first) / step > MOST_DEPTHS:
-            raise InputError(
-                f"depths = {list(self.depths)} are {(last - first) / step:.0f} steps: at most {MOST_DEPTHS}"
-            )
+        if self.depths is not None:
+            given = list(self.depths)
+            if len(given) not in (2, 3) or given[1] <= given[0] or min(given[2:], default=1.0) <= 0:
+                raise InputError(f"depths = {given}: give the first, the last and a step above 0, in rad/m2")
+            if len(given) == 3 and (given[1] - given[0]) / given[2] > MOST_DEPTHS:
+                steps = (given[1] - given[0]) / given[2]
+                raise InputError(f"depths = {given} are {steps:.0f} steps: at most {MOST_DEPTHS}")
         Signal21cm.table(self.signal)
         self.foreground_remover()
         return self
@@ -75,19 +83,59 @@ class CubeAnalysis(Component):
         found: ForegroundRemover = load("foregrounds", self.remove, **self.remover)
         return found
 
-    def depth_axis(self) -> Float:
-        """Faraday depths in rad/m² (N,), the last one included."""
-        first, last, step = self.depths
-        return np.asarray(first + step * np.arange(int(np.floor((last - first) / step * (1 + 1e-12) + 1e-9)) + 1))
+    def band(self, cube: StokesCube) -> FaradayBand:
+        """The band in which Q + iU of a cube has data and weight."""
+        from astropy import units as u
+
+        has = [bool(np.isfinite(planes[1] + planes[2]).any()) for planes in cube.data]
+        weights = np.ones(len(has)) if self.weights is None else np.asarray(self.weights)
+        if weights.shape != (len(has),):
+            raise InputError(f"weights are {len(weights)}, the cube has {len(has)} channels: give one for each")
+        return FaradayBand.of(cube.freq_hz * u.Hz, weights * has)
+
+    def depth_axis(self, cube: StokesCube) -> Float:
+        """Faraday depths in rad/m² (N,), the last one included: those asked for, or those of the band of a cube.
+
+        Raises `InputError` for steps between which peaks are missed; warns where the band reaches further.
+        """
+        band = self.band(cube)
+        if self.depths is not None and len(self.depths) == 3:
+            first, last, step = self.depths
+            if step > band.fwhm / 4 * (1 + 1e-6):
+                raise InputError(
+                    f"depths = {list(self.depths)}: in steps of {step:g} rad/m2 peaks are missed, the RMSF of this "
+                    f"band is {band.fwhm:.4g} wide (FWHM); give a step of {band.fwhm / 8:.3g}, or leave it out"
+                )
+            return np.asarray(first + step * np.arange(int(np.floor((last - first) / step * (1 + 1e-12) + 1e-9)) + 1))
+        if self.depths is not None:
+            first, last = self.depths
+            if (last - first) / (band.fwhm / 8) > MOST_DEPTHS:
+                raise InputError(
+                    f"depths = {list(self.depths)} are more than {MOST_DEPTHS} steps of {band.fwhm / 8:.3g}"
+                )
+            return band.depths(first, last)
+        each = cube.data[0, 0].size * (16 if cube.data.dtype.itemsize > 4 else 8)
+        most = int(np.clip(DEFAULT_BYTES // each, 65, MOST))
+        axis = band.depths(most=most)
+        if axis[-1] < band.phi_max - band.fwhm:
+            text = f"Faraday depths end at +-{axis[-1]:.4g} rad/m2 ({len(axis)} of them), this band sees sources out to"
+            warn(f"{text} {band.phi_max:.4g}: ask for them with depths (--depths FIRST,LAST)")
+        return axis
 
     def refusals(self, cube: StokesCube) -> dict[str, str]:
         """Why a cube cannot have some products, by product."""
         there = stokes_of(cube)
         out: dict[str, str] = {}
+        if self.weights is not None and len(self.weights) != len(cube.freq_hz):
+            raise InputError(
+                f"weights are {len(self.weights)}, the cube has {len(cube.freq_hz)} channels: one for each"
+            )
         if len(cube.freq_hz) < 2:
             out |= dict.fromkeys(("faraday", "cylindrical", "spherical", "window"), "one channel")
         if not {"Q", "U"} <= set(there):
             out.setdefault("faraday", "no Stokes Q and U with data")
+        if "faraday" not in out and self.wants("faraday"):
+            out |= self._no_depths(cube)
         if "I" not in there:
             out.setdefault("window", "no Stokes I with data, whose power is the leakage")
         missing = self._missing(cube, there)
@@ -106,6 +154,22 @@ class CubeAnalysis(Component):
         if asked:
             raise InputError(f"products = {'; '.join(asked)}")
         return out
+
+    def wants(self, product: Product) -> bool:
+        """Whether a product is asked for, or all are."""
+        return self.products is None or product in self.products
+
+    def _no_depths(self, cube: StokesCube) -> dict[str, str]:
+        """Why a cube has no Faraday depths, if so; raises `InputError` for depths asked for that will not do."""
+        band = self.band(cube)
+        if len(band.lambda2) < 2 or not np.isfinite(band.fwhm):
+            return {"faraday": f"{len(band.lambda2)} channel(s) with data and weight in Q and U"}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", InstrumentWarning)  # said when it runs
+            self.depth_axis(cube)
+        if self.clean and len(band.lambda2) < 3:
+            raise InputError("clean: RM-CLEAN goes down to a multiple of the noise, which two channels do not tell")
+        return {}
 
     def _missing(self, cube: StokesCube, there: list[str]) -> str | None:
         """Why the channels of a cube have no delays, if so."""
@@ -137,6 +201,7 @@ class CubeAnalysis(Component):
             if name not in stokes_of(cube):
                 result.left_out[f"Stokes {name}"] = "no data, or zero everywhere"
         kelvin = cube.to_kelvin() if cube.unit == "Jy/pixel" or _has_beam(cube) else cube
+        self._unused(wanted, noise)
         if noise is not None and noise.unit != kelvin.unit:
             noise = noise.to_kelvin()
         with warnings.catch_warnings(record=True) as said:
@@ -157,15 +222,35 @@ class CubeAnalysis(Component):
             warnings.warn(text, InstrumentWarning, stacklevel=2)
         return result
 
+    def _unused(self, wanted: list[Product], noise: StokesCube | None) -> None:
+        """Name the settings that no product uses."""
+        of: dict[str, tuple[Product, ...]] = {
+            "depths": ("faraday",), "weights": ("faraday",), "clean": ("faraday",), "signal": ("spherical", "window"),
+            "wedge": ("window",), "removed": ("window",), "bins": ("cylindrical", "spherical", "window"),
+            "infill": ("cylindrical", "spherical", "window"), "taper": ("cylindrical", "spherical", "window"),
+            "taper_space": ("spectrum-2d", "cylindrical", "spherical", "window"),
+            "uv_range": ("spectrum-2d", "cylindrical", "spherical", "window"),
+            "redshift": ("spectrum-2d", "cylindrical", "spherical", "window"),
+        }  # fmt: skip
+        given = [name for name in of if getattr(self, name) != type(self).model_fields[name].default]
+        idle = [name for name in given if not set(of[name]) & set(wanted)]
+        unused("analyze", idle, "no product that is made takes it")
+        if noise is not None and "window" not in wanted:
+            unused("analyze", ["noise"], "it is added to the leakage in the window, which is not made")
+
     def _faraday(self, cube: StokesCube, result: CubeResults) -> None:
         from astropy import units as u
 
+        axis = self.depth_axis(cube)
         with result.timed("Faraday depth"):
-            found = Analyzer(cube).rm_synthesis(self.depth_axis())
+            found = Analyzer(cube).rm_synthesis(axis, weights=self.weights)
         with result.timed("checks"):
             result.checks["Faraday depth"] = check_faraday(cube, found)
         with result.timed("Faraday depth"):
-            result.faraday, result.peaks = found, found.peaks()
+            if self.clean:
+                result.cleaned = found.clean(sigmas=CLEAN_SIGMAS)
+            result.faraday = found
+            result.peaks = (found if result.cleaned is None else result.cleaned.cube).peaks()
             top = np.nan_to_num(np.abs(found.data[0]))
             for plane in found.data[1:]:
                 np.maximum(top, np.nan_to_num(np.abs(plane)), out=top)
@@ -176,7 +261,11 @@ class CubeAnalysis(Component):
             alone: tuple[Stokes, ...] = ("I", "P", "V")
             for stokes in alone:
                 if stokes == "P" or np.nan_to_num(spectrum[:, "IQUV".index(stokes)]).any():
-                    result.lines[stokes] = Analyzer(pixel).rm_synthesis(self.depth_axis(), stokes=stokes)
+                    result.lines[stokes] = Analyzer(pixel).rm_synthesis(axis, stokes=stokes, weights=self.weights)
+            if result.cleaned is not None:
+                result.lines["P cleaned"] = replace(
+                    result.lines["P"], data=result.cleaned.restored[:, y : y + 1, x : x + 1]
+                )
 
     def _split(self, cube: StokesCube, result: CubeResults) -> None:
         remover = self.foreground_remover()
@@ -207,8 +296,7 @@ class CubeAnalysis(Component):
                     )
                 with result.timed("checks"):
                     check = check_cells(one, cells)
-                    if check is not None:
-                        result.checks[f"power spectrum of {name}"] = check
+                    result.checks[f"power spectrum of {name}"] = check
                 with result.timed("3D spectra"):
                     if "cylindrical" in wanted:
                         result.cylinders[name] = cells.cylindrical(self.bins)

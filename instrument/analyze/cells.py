@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from instrument.analyze.channel_grid import even_channels, infill_operator, same_grid
-from instrument.analyze.fourier import Stokes, Taper, check_stokes, comoving, line_of_sight, taper_of, uv_limits
+from instrument.analyze.fourier import (
+    Stokes,
+    Taper,
+    check_redshift,
+    check_stokes,
+    comoving,
+    line_of_sight,
+    taper_of,
+    uv_limits,
+)
 from instrument.errors import InputError, InstrumentWarning
 from instrument.image.cube import StokesCube
 from instrument.units import Bool, Complex, Float, Int, one_si
@@ -111,6 +120,7 @@ def cells_of(
     infill = None if infill is None else one_si(infill, "s", "infill", above=0)
     order, grid_hz, here = even_channels(cube, infill is not None)
     freq = float((grid_hz[0] + grid_hz[-1]) / 2)
+    redshift = check_redshift(redshift, float(grid_hz[0]), float(grid_hz[-1]))
     z, distance = comoving(freq, redshift, cosmology)
     depth = line_of_sight(z, cosmology)
     ny, nx = cube.data.shape[2:]

@@ -6,10 +6,10 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from instrument.errors import InputError, did_you_mean
+from instrument.errors import InputError, did_you_mean, warn
 from instrument.image.cube import StokesCube
 from instrument.observe.directions import LIGHT
-from instrument.units import COUNT, Complex, Float, Int, plain, to_si
+from instrument.units import COUNT, POSITIVE, Complex, Float, Int, plain, to_si
 
 HYDROGEN = 1420405751.768  # Hz, the 21-cm line at rest
 Stokes = Literal["I", "Q", "U", "V", "P"]
@@ -85,6 +85,19 @@ def comoving(freq_hz: float, redshift: float | None, cosmology: Any) -> tuple[fl
     if not isinstance(cosmology, FLRW | None):
         raise InputError(f"cosmology = {cosmology!r} is not one of astropy.cosmology, such as Planck18")
     return float(z), float((cosmology or Planck15).comoving_transverse_distance(z).to_value("Mpc"))
+
+
+def check_redshift(redshift: Any, low_hz: float, high_hz: float) -> float | None:
+    """The redshift given for a band, above 0; warns where its 21-cm line is further than 10 % from the band."""
+    if redshift is None:
+        return None
+    z = POSITIVE.check(redshift, "redshift")
+    line = HYDROGEN / (1 + z)
+    if not low_hz / 1.1 <= line <= high_hz * 1.1:
+        band = f"{low_hz / 1e6:.4g}" + (f" to {high_hz / 1e6:.4g}" if high_hz > low_hz else "")
+        right = HYDROGEN / ((low_hz + high_hz) / 2) - 1
+        warn(f"redshift = {z:g} has its 21-cm line at {line / 1e6:.4g} MHz, the cube is at {band} MHz, z = {right:.3g}")
+    return z
 
 
 def line_of_sight(redshift: float, cosmology: Any) -> float:

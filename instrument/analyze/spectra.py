@@ -15,6 +15,7 @@ from instrument.analyze.fourier import (
     bin_edges,
     bin_means,
     cell_variance,
+    check_redshift,
     comoving,
     plane,
     taper_of,
@@ -113,6 +114,7 @@ def spectrum_2d(
     variance, times = cell_variance(np.where(has, image - image[has].mean(), 0.0), window)
     v, u = (np.fft.fftfreq(n, cube.pixel_rad) for n in image.shape)
     uv = np.hypot(v[:, None], u[: variance.shape[1]])
+    redshift = check_redshift(redshift, cube.freq_hz[channel], cube.freq_hz[channel])
     z, distance = comoving(cube.freq_hz[channel], redshift, cosmology)
     low, high = uv_limits(uv_range)
     if not (use := (uv > 0) & (uv >= low) & (uv <= high)).any():

@@ -109,11 +109,14 @@ def test_one_channel_has_a_2d_spectrum_and_nothing_more(tmp_path, capsys):
     ("words", "said"),
     [
         (["--products", "sphrical"], "products.0 = 'sphrical'"),
-        (["--depths", "-5,5"], "depths"),
+        (["--depths", "-5"], "depths"),
         (["--depths", "5,-5,1"], "give the first, the last and a step above 0"),
         (["--depths", "0,1e9,0.1"], "at most 20001"),
         (["--depths", "a,b,c"], "--depths a,b,c: numbers with commas between"),
-        (["--uv-range", "800,30", "--products", "spherical"], "the smaller one first"),
+        (
+            ["--uv-range", "800,30", "--products", "spherical"],
+            "uv_range = (800.0, 30.0) must be two increasing finite numbers",
+        ),
         (["--taper", "hamming"], "taper = 'hamming'"),
         (["--signal", "EOS"], "no 21-cm model is called 'EOS'"),
         (["--remove", "gmka"], "did you mean 'gmca'"),
