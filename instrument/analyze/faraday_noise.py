@@ -53,9 +53,11 @@ def channel_noise(
     if seen.min() >= ENOUGH:
         variance = _of_channels(first, shares, np.where(quiet, power, 0).sum(axis=1) / seen, len(x), 3 / seen.min())
     variance = variance if variance.any() else np.ones(len(x))
-    mean, median = _spread(first, factors, variance / w, middle, real)
+    mean, freedom = _spread(first, factors, variance / w, middle, real)
+    # the median of chi²_k over its mean is (1 - 2/9k)³, and k goes with the differences that a pixel has
+    total /= np.maximum(1 - 2 / (9 * freedom * np.maximum(whole, 1e-3 * middle.sum()) / middle.sum()), 0.3) ** 3
     out = np.empty(len(lambda2))
-    out[order] = np.sqrt(float(np.nanmedian(total)) / median / mean * variance / w)
+    out[order] = np.sqrt(float(np.nanmedian(total)) / mean * variance / w)
     return out
 
 
@@ -98,10 +100,10 @@ def _differences(x: Float, w: Float) -> tuple[Any, Float] | None:
 
 
 def _spread(first: Any, factors: Float, variance: Float, middle: Float, real: bool) -> tuple[float, float]:
-    """Weighted mean of squared differences of Gaussian noise, and its median over that: (1 - 2/9k)³ of chi²_k."""
+    """Weighted mean of the squared differences of Gaussian noise, and of how many degrees of freedom it is."""
     spread, places = np.zeros((len(first), len(variance))), _places(first, factors)
     spread[np.arange(len(first))[:, None], places] = factors * np.sqrt(variance)[places]
     alike = spread @ spread.T
     mean = float(middle @ np.diagonal(alike))
     freedom = mean**2 / float(middle @ alike**2 @ middle) * (1 if real else 2)
-    return mean / float(middle.sum()), (1 - 2 / (9 * freedom)) ** 3
+    return mean / float(middle.sum()), freedom

@@ -1,0 +1,187 @@
+"""Pulls: how far results lie from the truth, over the error that the package prints for them, as a table.
+
+    python docs/reports/pulls.py [--draws 1000] [--areas faraday,spectra]
+
+writes docs/reports/pulls.md. A pull is the scatter of (found - true) / error over draws of noise: 1 where the error
+is the scatter. Of powers in few modes, whose error goes with the power that is found, it is the scatter over the mean error.
+Each area is one function `(draws, seed) -> rows`; a row is (case, what, pull).
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import time
+import warnings
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from astropy import units as u
+
+from instrument import Analyzer, StokesCube, __version__
+from instrument.errors import InstrumentWarning
+
+Row = tuple[str, str, float]
+LIGHT = 299792458.0
+BAND = 134e6 + 1e6 * np.arange(33)
+
+
+def _cube(data, freq=BAND, pixel=3 * u.arcmin):
+    return StokesCube(data, freq * u.Hz, pixel, "K")
+
+
+def _screen(draws, snr, seed, freq=BAND, sigma=None, depth=7.3, angle=0.4, index=0.0):
+    """`draws` lines of sight with one screen of 1 at 150 MHz and noise that leaves it `snr` sigmas; and sigma (F,)."""
+    rng = np.random.default_rng(seed)
+    shape = np.ones(len(freq)) if sigma is None else np.asarray(sigma, float)
+    sigma = shape * np.sqrt(len(freq)) / snr
+    p = (freq / 150e6) ** index * np.exp(2j * (angle + depth * (LIGHT / freq) ** 2))
+    data = sigma[:, None, None, None] * rng.normal(size=(len(freq), 4, 1, draws))
+    data[:, 1] += p.real[:, None, None]
+    data[:, 2] += p.imag[:, None, None]
+    return data, sigma
+
+
+def _of_peaks(case, peaks, scale, lambda2_0, depth=7.3, angle=0.4):
+    good = peaks.significant[0]
+
+    def spread(name, off):
+        return float(np.std((off / getattr(peaks, name)[0])[good]))
+
+    turned = [np.angle(np.exp(2j * (x - t))) / 2
+              for x, t in ((peaks.angle[0], angle), (peaks.angle_0[0], angle + depth * lambda2_0))]  # fmt: skip
+    return [
+        (case, "depth", spread("depth_error", peaks.depth[0] - depth)),
+        (case, "polarized intensity", float(np.std(((peaks.polarized - scale) / peaks.noise)[0][good]))),
+        (case, "angle emitted", spread("angle_error", turned[0])),
+        (case, "angle at lambda0^2", spread("angle_0_error", turned[1])),
+    ]
+
+
+def faraday(draws: int, seed: int = 0) -> list[Row]:
+    """Depth, polarized intensity and angles of one screen in a pixel."""
+    rows: list[Row] = []
+
+    def add(case, data, snr=8.0, scale=1.0, clean=False, depths=None, **settings):
+        found = Analyzer(_cube(data)).rm_synthesis(depths, **settings)
+        cube = found.clean(sigmas=3).cube if clean else found
+        rows.extend(_of_peaks(case, cube.peaks(snr=snr), scale, found.lambda2_0))
+
+    x = (LIGHT / BAND) ** 2
+    data, _ = _screen(draws, 15, seed)
+    add("even weights, noise measured, 15 sigma", data)
+    add("the same, lambda0^2 = 0", data, lambda2_0=0)
+    add("the same after RM-CLEAN", data, clean=True)
+    data, _ = _screen(draws, 9, seed + 1)
+    add("9 sigma, peaks from 5", data, snr=5.0)
+    data, _ = _screen(draws, 2000, seed + 2)
+    add("2000 sigma, steps of FWHM / 4", data, depths=0.53 * np.arange(-40, 41))
+    sigma = np.random.default_rng(seed + 3).uniform(0.5, 2, len(BAND))
+    data, real = _screen(draws, 15, seed + 4, sigma=sigma)
+    add("noise differs by channel, weights 1/sigma^2, given", data, weights=1 / sigma**2, noise=real)
+    add("noise differs by channel, even weights, given", data, noise=real)
+    add("noise grows along the band, even weights, measured",
+        _screen(draws, 15, seed + 5, sigma=np.linspace(0.5, 2, len(BAND)))[0])  # fmt: skip
+    data, _ = _screen(draws, 15, seed + 6)
+    add("weights of a Gaussian taper", data, weights=np.exp(-(((x - x.mean()) / 0.6) ** 2)))
+    gone = np.random.default_rng(seed + 7).random((len(BAND), 1, draws)) < 0.3
+    gone[:12, :, ::2] = True
+    data[:, 1][gone] = np.nan
+    add("a third of the voxels missing, of half the pixels also the lower third of the band", data)
+    data, _ = _screen(draws, 15, seed + 8, index=-0.8)
+    data[:, 0] += 2 * ((BAND / 150e6) ** -0.8)[:, None, None]
+    scale = (LIGHT / np.sqrt(x.mean()) / 150e6) ** -0.8
+    add("divided by the power law fitted to Stokes I", data, divide_by_i="fit", scale=scale)
+    return rows
+
+
+def _of_powers(case, makes: Callable[[int], list], draws: int) -> list[Row]:
+    """Scatter of every bin over its mean error: the median bin, and the ones furthest off."""
+    made = [makes(k) for k in range(draws)]
+    rows = []
+    for n in range(len(made[0])):
+        power = np.array([m[n][0].ravel() for m in made])
+        sigma = np.array([m[n][1].ravel() for m in made])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            pull = power.std(axis=0) / sigma.mean(axis=0)
+        pull = pull[np.isfinite(pull)]
+        what = made[0][n][2]
+        rows += [(case, f"{what}, median of {len(pull)} bins", float(np.median(pull)))]
+        rows += [(case, f"{what}, lowest and highest bin", float(edge)) for edge in (pull.min(), pull.max())]
+    return rows
+
+
+def spectra(draws: int, seed: int = 0) -> list[Row]:
+    """Powers of white noise in 2D, cylindrical and spherical spectra, with and without tapers, cuts and holes."""
+    rows: list[Row] = []
+    freq, n = BAND[:24], 24
+    hole = np.hypot(*(np.indices((n, n)) - n // 2)) > 9
+    for case, stokes, taper, space, holes in (
+        ("no taper", "I", None, None, False),
+        ("tapers along frequency and over the images", "I", "blackman-harris", "hann", False),
+        ("tapers, Q + iU", "P", "blackman-harris", "hann", False),
+        ("a round hole in the field, taper along frequency", "I", "blackman-harris", None, True),
+    ):
+
+        def make(k, stokes=stokes, taper=taper, space=space, holes=holes):
+            data = np.random.default_rng([seed, k]).normal(size=(len(freq), 4, n, n))
+            if holes:
+                data[:, :, hole] = np.nan
+            analyzer = Analyzer(_cube(data, freq))
+            cells = analyzer.cells(stokes, taper, space)
+            plane, tube, ball = (
+                analyzer.spectrum_2d(stokes, taper=space, bins=6),
+                cells.cylindrical(6),
+                cells.spherical(8),
+            )
+            binned = cells.cylindrical(6, 5)
+            return [
+                (s.power, s.sigma, what)
+                for s, what in ((plane, "2D"), (tube, "cylindrical, each delay"), (binned, "cylindrical"),
+                                (ball, "spherical"))
+            ]  # fmt: skip
+
+        rows += _of_powers(case, make, draws)
+    return rows
+
+
+AREAS: dict[str, Callable[[int, int], list[Row]]] = {"faraday": faraday, "spectra": spectra}
+
+
+def main() -> None:
+    """Write the table beside this file."""
+    asked = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    asked.add_argument("--draws", type=int, default=1000)
+    asked.add_argument("--areas", default=",".join(AREAS))
+    given = asked.parse_args()
+    lines = [
+        "# Pulls of printed errors",
+        "",
+        f"{datetime.now(UTC):%Y-%m-%d}, instrument {__version__}, numpy {np.__version__}, Python {platform.python_version()}; "
+        f"{given.draws} draws. Made by [pulls.py](pulls.py), which says what a pull is. Asked for: 0.9 to 1.1.",
+    ]
+    for name in given.areas.split(","):
+        begin = time.perf_counter()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", InstrumentWarning)
+            rows = AREAS[name](given.draws, 0)
+        spent = time.perf_counter() - begin
+        text = AREAS[name].__doc__.splitlines()[0]
+        lines += [
+            "",
+            f"## {name.capitalize()}",
+            "",
+            f"{text} ({spent:.0f} s)",
+            "",
+            "| case | what | pull |",
+            "|---|---|---|",
+        ]
+        lines += [f"| {case} | {what} | {pull:.3f} |" for case, what, pull in rows]
+    Path(__file__).with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()
