@@ -3,8 +3,8 @@
     python docs/reports/pulls.py [--draws 1000] [--areas faraday,spectra]
 
 writes docs/reports/pulls.md. A pull is the scatter of (found - true) / error over draws of noise: 1 where the error
-is the scatter. Of powers in few modes, whose error goes with the power that is found, it is the scatter over the mean error.
-Each area is one function `(draws, seed) -> rows`; a row is (case, what, pull).
+is the scatter. Of powers in few modes, whose error goes with the power that is found, it is the scatter over the
+mean error. Each area is one function `(draws, seed) -> rows`; a row is (case, what, pull).
 """
 
 from __future__ import annotations
@@ -159,8 +159,9 @@ def main() -> None:
     lines = [
         "# Pulls of printed errors",
         "",
-        f"{datetime.now(UTC):%Y-%m-%d}, instrument {__version__}, numpy {np.__version__}, Python {platform.python_version()}; "
-        f"{given.draws} draws. Made by [pulls.py](pulls.py), which says what a pull is. Asked for: 0.9 to 1.1.",
+        f"{datetime.now(UTC):%Y-%m-%d}, instrument {__version__}, numpy {np.__version__}, "
+        f"Python {platform.python_version()}; {given.draws} draws. Made by [pulls.py](pulls.py), which says what a pull "
+        "is. Asked for: 0.9 to 1.1.",
     ]
     for name in given.areas.split(","):
         begin = time.perf_counter()
