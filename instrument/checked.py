@@ -165,7 +165,11 @@ def _literal(words: tuple[Any, ...]) -> Door:
     def door(value: Any, name: str) -> Any:
         if not any(type(value) is type(word) and value == word for word in words):
             listed = f"{name} = {brief(value)} is not one of {', '.join(repr(w) for w in words)}"
-            near = did_you_mean(value, words).partition("?")[0] if isinstance(value, str) else ""
+            near = (
+                did_you_mean(value, [w for w in words if isinstance(w, str)]).partition("?")[0]
+                if isinstance(value, str)
+                else ""
+            )
             raise InputError(f"{listed}: {near}?" if near.startswith("did") else listed)
         return value
 

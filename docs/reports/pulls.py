@@ -160,8 +160,8 @@ def main() -> None:
         "# Pulls of printed errors",
         "",
         f"{datetime.now(UTC):%Y-%m-%d}, instrument {__version__}, numpy {np.__version__}, "
-        f"Python {platform.python_version()}; {given.draws} draws. Made by [pulls.py](pulls.py), which says what a pull "
-        "is. Asked for: 0.9 to 1.1.",
+        f"Python {platform.python_version()}; {given.draws} draws. Made by [pulls.py](pulls.py), which says what a "
+        "pull is. Asked for: 0.9 to 1.1.",
     ]
     for name in given.areas.split(","):
         begin = time.perf_counter()

@@ -204,7 +204,7 @@ class Analyzer:
         weights: Any = None,
         lambda2_0: Any = None,
         spectral_index: float | None = None,
-        divide_by_i: bool | Division = False,
+        divide_by_i: Division = False,
         precision: Precision | None = None,
         out: str | os.PathLike[str] | None = None,
         noise: Any = None,

@@ -21,7 +21,7 @@ from instrument.observe.directions import LIGHT
 from instrument.units import Complex, Float
 
 Precision = Literal["single", "double"]
-Division = Literal["voxel", "fit"]
+Division = Literal[True, False, "voxel", "fit"]
 SAMPLE = 4096  # pixels whose noise is measured
 CHUNK_BYTES = 8 << 20  # of one product: 4 to 16 MB cost the same within 5 %
 RELEASE_BYTES = 256 << 20  # written to a file between two releases of its pages
@@ -34,7 +34,7 @@ def rm_synthesis(
     weights: Any = None,
     lambda2_0: Any = None,
     spectral_index: float | None = None,
-    divide_by_i: bool | Division = False,
+    divide_by_i: Division = False,
     precision: Precision | None = None,
     out: str | os.PathLike[str] | None = None,
     noise: Any = None,

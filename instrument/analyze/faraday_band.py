@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -82,6 +82,9 @@ def half_height(lambda2: Any, weights: Any) -> float:
     return 0.5 * (left + right)
 
 
+PerhapsNaN = Annotated[float, "NaN where it is not known"]  # no door of `checked` for it
+
+
 @checked
 @dataclass(frozen=True, eq=False)
 class FaradayBand:
@@ -92,7 +95,7 @@ class FaradayBand:
 
     lambda2: Float
     weights: Float
-    channel_m2: float
+    channel_m2: PerhapsNaN
 
     @classmethod
     def of(cls, frequencies: Any, weights: Any = None, channel_width: Any = None) -> FaradayBand:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from instrument.analyze.faraday_band import FaradayBand, number
+from instrument.analyze.faraday_band import FaradayBand, PerhapsNaN, number
 from instrument.checked import checked
 from instrument.observe.directions import LIGHT
 from instrument.units import Complex, Direction, Float
@@ -46,7 +46,7 @@ class FaradayCube:
     unit: str
     stokes: str
     noise: float | None
-    measured_noise: float
+    measured_noise: PerhapsNaN
     channel_noise: Float
     flags: Any
     pixel_rad: float

@@ -217,5 +217,5 @@ def test_e12_the_fitted_power_law_is_unbiased_at_low_signal():
 
 def test_e12_a_division_that_is_none_is_refused():
     cube = screens(WIDE[1], 1.0, 0.01)
-    with pytest.raises(InputError, match="divide_by_i = 'power' is not one of True, False, 'voxel' or 'fit'"):
+    with pytest.raises(InputError, match="divide_by_i = 'power' is not one of True, False, 'voxel'"):
         Analyzer(cube).rm_synthesis([0.0], divide_by_i="power")
