@@ -111,7 +111,7 @@ def test_a8_directions_that_have_both_are_turned():
         (lambda v: FaradaySky(depths=(v, 5.0)), "depths"),
         (lambda v: GridSky(polarization=(v, 0.0, 0.0)), "polarization"),
         (lambda v: Catalogue(path="x", brightest=v), "brightest"),
-        (lambda v: PointSky.at(CENTRE, [1.0]).brightest(v), "brightest"),
+        (lambda v: PointSky.at(CENTRE, [1.0]).brightest(v), "count"),
     ],
 )
 def test_numbers_of_skies_go_through_the_checked_door(make, message):
