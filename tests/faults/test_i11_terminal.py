@@ -74,16 +74,28 @@ def test_i12_a_stop_after_the_folder_was_moved_says_that_it_is_written(tmp_path,
     assert (tmp_path / "o").is_dir()
 
 
+SCENE = """name = "tiny"
+instrument = { telescope = "lofar-hba", stations = ["CS001HBA0", "CS002HBA0"], beam = "none" }
+sky = { kind = "grid", shape = [1, 1] }
+[observation]
+phase_centre = "08h13m36.0s +48d13m03s"
+start = "2012-12-07T00:00:00"
+duration = "20 s"
+interval = "10 s"
+frequencies = ["150 MHz"]
+"""
+
+
 def test_i12_a_worker_that_raises_anything_is_one_line(tmp_path, capsys, monkeypatch):
     from instrument.predict.matrix import Matrix
 
+    (tmp_path / "s.toml").write_text(SCENE)
     for error, line in ((RuntimeError("boom"), "unexpected RuntimeError: boom"), (SystemExit(3), "exit(3)")):
         monkeypatch.setattr(Matrix, "sums", lambda self, problem, error=error: raiser(error)())
-        words = ["run", "mock-grid", "--out", str(tmp_path / "o"), "--set", "observation.interval='4 h'", "--no-verify"]
-        assert cli.main([*words, "--workers", "2"]) == 1
+        assert cli.main(["run", str(tmp_path / "s.toml"), "--out", str(tmp_path / "o"), "--workers", "2"]) == 1
         said = capsys.readouterr().err
         assert line in said and said.count("\n") == 1
-        assert os.listdir(tmp_path) == []
+        assert os.listdir(tmp_path) == ["s.toml"]
 
 
 LIGHT = [sys.executable, "-m", "instrument.cli", "scenes"]

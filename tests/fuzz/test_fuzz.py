@@ -6,7 +6,7 @@ The default run takes a small sample; `long` some hundreds; `--fuzz 3000` thousa
 import pytest
 from fuzzing.choose import cases
 
-SAMPLE, LONG = 18, 400
+SAMPLE, LONG = 12, 400
 
 
 def faults(zygote, count, seed):

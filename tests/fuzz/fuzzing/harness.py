@@ -103,6 +103,11 @@ class Zygote:
         return answer
 
     def judge(self, case: Case) -> Verdict:
+        """What comes of a case; a hang is tried twice, for the first may have compiled what the second finds."""
+        found = self._judged(case)
+        return self._judged(case) if found.verdict == "FAULT hang" else found
+
+    def _judged(self, case: Case) -> Verdict:
         """Make the files of a case, run it, and say what came of it; the folder is removed when that is good."""
         folder = self.folder / "case"
         shutil.rmtree(folder, ignore_errors=True)
