@@ -27,4 +27,4 @@ print(plan, "\n")
 total = sum(abs(block.data).sum() for block in plan.blocks())  # memory stays that of a block
 vis = plan.run()  # or all at once
 print(f"{vis.data.shape} (times, channels, baselines, 2, 2); sum of magnitudes {total:.6g} Jy")
-print(plan.verify(samples=200, seed=0))
+print(plan.verify(vis, samples=200, seed=0))  # what was produced, against the definition

@@ -327,3 +327,14 @@ def test_total_flux_is_that_of_the_brightest_channel():
     problem = scene(sky, frequencies=(75, 150)).plan().full
     assert total_flux(problem) == pytest.approx(4.0, rel=1e-12)
     assert instrument.load("engines", "direct") == Direct()
+
+
+def test_f2_conformance_finds_an_engine_whose_bound_is_not_held():
+    class Liar(Coarse):
+        def prepare(self, problem, tolerance):
+            return Prepared(Coarse(factor=1 + tolerance), 1e-3 * tolerance)
+
+    broken = [line.claim for line in instrument.conformance.check(Liar()).failed]
+    assert any(claim.startswith("it agrees with direct") for claim in broken)
+    assert not instrument.conformance.check(Coarse()).failed
+    assert "it is the definition, so by stations" in str(instrument.conformance.check(Direct()))
