@@ -134,10 +134,6 @@ class Checker:
             self._compare(full, t, f, block, i, j)
         self.spent += time.perf_counter() - begin
 
-    def holds(self, block: Visibilities) -> bool:
-        """Whether any of the chosen cells is in a block."""
-        return bool(self._within(block, self.full))
-
     def _within(self, block: Visibilities, full: Problem) -> list[tuple[int, int, int, int]]:
         """Chosen cells of a block: time and channel in the scene, and in the block."""
         _same_scene(block, full)
