@@ -213,7 +213,7 @@ def cell_seconds(problem: Problem) -> float:
     shaped = sources if listed is None else int(listed.gaussian.sum())
     matrices = 0.1e-6 + 0.35e-6 * len(problem.chain.terms)
     return (
-        1.5e-3
+        2.5e-3
         + stations * sources * matrices
         + 2.5e-9 * sources * parts
         + 32.0 * stations**2 * sources / 10e9
