@@ -8,7 +8,6 @@ share that is found is to be the share that the check prints. Writes sabotage.md
 """
 
 import argparse
-import os
 import platform
 import time
 from dataclasses import replace
@@ -112,8 +111,8 @@ as they stream by; every case has its own seed. Unspoilt data: {check}.
 """ + "\n".join(rows)
     text += f"""
 
-The check took {spent:.2f} s of processor time, the prediction {predicted:.1f} s: {100 * spent / predicted:.1f} %
-(on {os.cpu_count()} cores, of a wall time that is shorter by as much at best: {100 * spent / predicted * os.cpu_count():.1f} %).
+Processor time: the check {spent:.2f} s, the prediction {predicted:.1f} s, {100 * spent / predicted:.1f} %
+of it, and of a run that does nothing else.
 """
     (HERE / "sabotage.md").write_text(text, encoding="utf-8")
     print(text)
