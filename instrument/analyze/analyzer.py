@@ -18,6 +18,7 @@ from instrument.analyze.spectra import Spectrum2D, spectrum_2d
 from instrument.analyze.window import EoRWindow, eor_window
 from instrument.checked import checked
 from instrument.errors import InputError
+from instrument.image.common_beam import say_unequal_beams
 from instrument.image.cube import StokesCube
 from instrument.sky.base import Sky
 from instrument.units import Direction, Index
@@ -228,6 +229,7 @@ class Analyzer:
         """
         if self.cube is None:
             raise InputError("rm_synthesis needs a cube: Analyzer(cube)")
+        say_unequal_beams(self.cube)
         given = (depths, stokes, weights, lambda2_0, spectral_index, divide_by_i, precision, out, noise, progress)
         return rm_synthesis(self.cube, *given)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from astropy import units as u
 
-from instrument import InputError, Psf, StokesCube
+from instrument import Analyzer, InputError, Psf, StokesCube
 from instrument.errors import InstrumentWarning
 from instrument.image.common_beam import beam_ratio, common_beam, say_unequal_beams, shapes
 
@@ -36,6 +36,8 @@ def test_e14_unequal_beams_are_said_with_their_ratio():
     assert beam_ratio(PSF) == pytest.approx(np.sqrt(12 / 7.5))
     with pytest.warns(InstrumentWarning, match="beams of the channels differ by a factor of 1.26 in width"):
         say_unequal_beams(cube())
+    with pytest.warns(InstrumentWarning, match="differ by a factor of 1.26 in width"):
+        Analyzer(cube()).rm_synthesis([0.0, 1.0])
 
 
 def test_e14_a_point_of_1_jy_stays_1_jy_and_has_the_common_beam_in_every_channel():
