@@ -15,8 +15,8 @@ from instrument.files.fits_sky import Grid, grid_of
 from instrument.files.fits_spectral import frequencies_of, plausible
 from instrument.files_in import harmless
 from instrument.image.cube import Unit
-from instrument.memory import machine_memory
-from instrument.units import Float, si_prefix
+from instrument.memory import afford
+from instrument.units import Float
 
 # with spaces, dots and asterisks left out; of BUNIT in capitals only what cannot be read in two ways
 FLUX = re.compile(r"([mµuμ]?)jy(?:/|per)?(?:(beam|bm)|(pixel|pix))(?:-1|\^-1)?|(?:beam|bm)-1([mµuμ]?)jy")
@@ -109,10 +109,10 @@ def _described(path: Path, k: int, hdus: Any, others: list[tuple[int, Any]], giv
 
 def affordable(file: str, channels: int, ny: int, nx: int, wide: bool) -> None:
     """Raises `RefusedError` for a cube (F, 4, Ny, Nx) that this machine does not hold, before any of it is made."""
-    need, there = channels * 4.0 * ny * nx * (8 if wide else 4), machine_memory()
-    if need > 0.75 * there or channels > MOST_CHANNELS:
-        size = f"{channels} x 4 x {ny} x {nx} is {si_prefix(need, 'B')}, this machine has {si_prefix(there, 'B')}"
-        raise RefusedError(f"{file}: a cube of {size}: cut out channels or a part of the image")
+    if channels > MOST_CHANNELS:
+        raise RefusedError(f"{file}: {channels} channels, at most {MOST_CHANNELS} are read: cut out a part")
+    size = channels * 4.0 * ny * nx * (8 if wide else 4)
+    afford(size, f"{file}: a cube of {channels} x 4 x {ny} x {nx}", "cut out channels or a part of the image")
 
 
 def _names(file: str, header: Any, axes: dict[Role, int], given: Given) -> tuple[list[str], list[str]]:

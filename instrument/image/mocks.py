@@ -17,6 +17,7 @@ from instrument.checked import checked
 from instrument.component import Component
 from instrument.errors import InputError
 from instrument.image.cube import Psf, StokesCube
+from instrument.memory import afford
 from instrument.observe.directions import LIGHT
 from instrument.units import Complex, Float, Radians, Seed, direction, to_si
 
@@ -101,6 +102,9 @@ def polarized_screens(
         raise InputError(f"pixels = {pixels} (4 or more), pixel = {pixel}, frequencies: all must be above 0")
     if not screens.depths or not screens.uv_range[0] < screens.uv_range[1]:
         raise InputError(f"screens need depths and a uv_range that grows, got {screens.depths}, {screens.uv_range}")
+    # the cube, and fields of every screen in complex64
+    size = float(pixels) ** 2 * (16.0 * len(freq) + 8.0 * (2 * len(screens.depths) + 4))
+    afford(size, f"a cube of {len(freq)} channels of {pixels} x {pixels} pixels", "ask for fewer")
     uv, rng = _uv(pixels, step), np.random.default_rng(seed)
     if not ((uv > 0) & (uv >= screens.uv_range[0]) & (uv <= screens.uv_range[1])).any():
         raise InputError(f"{pixels} pixels have no cell within uv_range = {screens.uv_range}: take more or larger ones")

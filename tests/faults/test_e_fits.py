@@ -12,7 +12,7 @@ from astropy import units as u
 from astropy.coordinates import FK4, SkyCoord
 from astropy.io import fits
 
-from instrument import InputError, Psf, StokesCube, read_cube
+from instrument import InputError, Psf, StokesCube, polarized_screens, read_cube
 from instrument.errors import FileError, InstrumentWarning, RefusedError
 
 F, N = 4, 16
@@ -347,7 +347,18 @@ def test_i5_a_cube_that_memory_does_not_hold_is_refused(path):
     head["NAXIS3"] = 500_000_000
     path.write_bytes(head.tostring().encode("ascii"))
     os.truncate(path, len(head.tostring()) + 4 * N * N * 500_000_000)
-    assert peak_of(refused, "a cube of .*: cut out channels", path, error=RefusedError) < 4e6
+    assert peak_of(refused, "a.fits: 500000000 channels, at most", path, error=RefusedError) < 4e6
+
+
+def test_i5_a_cube_of_a_few_channels_that_memory_does_not_hold_is_refused(path):
+    head = header()
+    head["NAXIS1"], head["NAXIS2"], head["NAXIS3"] = 100_000, 100_000, 10
+    path.write_bytes(head.tostring().encode("ascii"))
+    os.truncate(path, len(head.tostring()) + 4 * 10**11)
+    said = "a cube of 10 x 4 x 100000 x 100000 would take 1.6 TB of memory, and .*: cut out channels"
+    assert peak_of(refused, said, path, error=RefusedError) < 4e6
+    with pytest.raises(RefusedError, match="a cube of 161 channels of 100000 x 100000 pixels would take 27.7 TB"):
+        polarized_screens(100_000)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")
