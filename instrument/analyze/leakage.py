@@ -15,7 +15,7 @@ from instrument.jones.chain import Chain
 from instrument.jones.mueller import TO_LINEAR, TO_STOKES
 from instrument.observe.directions import separation
 from instrument.observe.sampling import Sampling
-from instrument.units import Bool, Complex, Direction, Float, unit_vectors
+from instrument.units import Bool, Complex, Direction, Float, Whole, unit_vectors
 from instrument.whole_file import write_ecsv
 
 NULL = 0.01  # apparent over true flux below which a source lies near a null of the beam
@@ -27,11 +27,12 @@ CLEAR = 0.1  # % of I: error up to which a leakage counts as measured; never by 
 class Leakage:
     """Leakage of every source, one channel: fluxes (G, 4) in Jy, leakages in % of its apparent I (G,).
 
-    The polarization that the sky has there, as a fraction of I, is taken out first. `error_jy` (4,) is what the rest of
-    the visibilities leaves on a flux (see `SourceFluxes`). `near_null` marks sources whose apparent flux is below 1 %
-    of the true one: their leakage is a ratio of two small numbers and says little about the instrument. `measured`
-    leaves those out, those that have no Stokes I in the sky, and those too faint beside their neighbours to be known to
-    0.1 % or a third of the leakage. Sources that the tolerance of a plan drops are not in what a run measures.
+    The polarization that the sky has there, as a fraction of I, is taken out first. `error_jy` (G, 4) are the errors of
+    the fluxes (see `SourceFluxes`), `error_percent` those of the leakages to first order. `near_null` marks sources
+    whose apparent flux is below 1 % of the true one: their leakage is a ratio of two small numbers and says little
+    about the instrument. `measured` leaves those out, those that have no Stokes I in the sky, and those too faint
+    beside their neighbours to be known to 0.1 %. Sources that the tolerance of a plan drops are not in what a run
+    measures.
     `expected` holds the same leakages (G, 2) from the beam model (the mean Mueller matrix over baselines and times),
     where it was asked for.
     """
@@ -70,9 +71,18 @@ class Leakage:
 
     @property
     def error_percent(self) -> Float:
-        """Errors of the linear and the circular leakage, % of I (G, 2)."""
-        linear = np.hypot(self.error_jy[1], self.error_jy[2])
-        return np.stack([self._share(linear), self._share(self.error_jy[3])], axis=1)
+        """Errors of the linear and the circular leakage, % of I (G, 2): of Q/I, U/I along their sum, and of V/I.
+
+        To first order; a leakage below its error scatters less, and is biased upwards (Rice).
+        """
+        with np.errstate(divide="ignore", invalid="ignore"):
+            seen = self.stokes_jy[:, 1:] / self.stokes_jy[:, :1]
+            common = (self.error_jy[:, 0] / self.stokes_jy[:, 0]) ** 2
+            q, u, v = ((self.error_jy[:, 1:] / self.stokes_jy[:, :1]) ** 2).T
+            along = self.leaked_jy[:, :2] / np.hypot(*self.leaked_jy[:, :2].T)[:, None]
+            along = np.where(np.isfinite(along), along, np.sqrt(0.5))
+        linear = along[:, 0] ** 2 * q + along[:, 1] ** 2 * u + (along * seen[:, :2]).sum(axis=1) ** 2 * common
+        return 100 * np.sqrt(np.stack([linear, v + seen[:, 2] ** 2 * common], axis=1))
 
     @property
     def measured(self) -> Bool:
@@ -149,6 +159,7 @@ class Leakage:
 
 def leakage_of(fluxes: SourceFluxes, centre: Direction, channel: int = 0, expected: Float | None = None) -> Leakage:
     """Leakage of measured fluxes in one channel, about a centre."""
+    channel = Whole(at_least=0, at_most=len(fluxes.freq_hz) - 1).check(channel, "channel")
     measured, model = fluxes.stokes_jy[channel], fluxes.model_jy[channel]
     with np.errstate(invalid="ignore"):
         null = np.abs(measured[:, 0]) < NULL * np.abs(model[:, 0])

@@ -12,7 +12,7 @@ from instrument.errors import InputError
 from instrument.observe.directions import LIGHT, lmn
 from instrument.phasor import station_phases
 from instrument.sky.points import PointSky
-from instrument.units import Complex, Float, Int
+from instrument.units import UV_RANGE, Complex, Float, Int
 from instrument.visibilities import Visibilities
 
 
@@ -31,7 +31,7 @@ class OffsetSums:
         count = np.bincount(group)[group]
         self.mix = np.where(total > 0, flux / np.where(total > 0, total, 1), 1 / count)
         self.shaped = np.flatnonzero(sky.gaussian)
-        self.uv_range = uv_range
+        self.uv_range = None if uv_range is None else UV_RANGE.check(uv_range, "uv_range")
         self.normal = np.zeros((3 * len(self.first),) * 2)
         self.right: Float | None = None
 

@@ -12,20 +12,20 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field
 
+from instrument.analyze.told_apart import coincide, positive_solve
 from instrument.component import Component
 from instrument.errors import InputError, Outcome
 from instrument.jones import mueller
 from instrument.observe.directions import LIGHT, lmn
 from instrument.phasor import station_phases
 from instrument.sky.points import PointSky
-from instrument.units import Complex, Float, Int, unit_vectors
+from instrument.units import Complex, Count, Float, Int, Real, UvRange, unit_vectors
 from instrument.visibilities import Visibilities
 
 MOST_DIRECT = 6000  # sources up to which the PSF matrix (300 MB) is formed; above, conjugate gradients
 ROWS = 512  # of that matrix at a time
-CLOSE = 1e-4  # of 1 / longest baseline in wavelengths: sources nearer than this cannot be told apart
+PRODUCTS = 2.5e10  # of a PSF matrix that is made for errors alone: 1 s
 CANCELS = 1e-6  # |sum I| over sum |I| of a patch below which its parts cancel
 ROUNDING = 4 * float(np.finfo(float).eps)  # of sum w |V|^2, below which nothing is known of what a solution leaves
 
@@ -35,10 +35,11 @@ class SourceFluxes:
     """Measured Stokes fluxes in Jy (F, G, 4) of G groups of sources (a patch, or a source by itself).
 
     The sources of a patch keep the shares of its Stokes I that they have in the sky, channel by channel.
-    `error_jy` is the rms of what the solution leaves in the real or imaginary part of the visibilities over the root of
-    their number: right for noise. The change of apparent fluxes with time and baseline, which a constant flux cannot
-    follow, counts as noise here; it is not independent, and true errors of simulated fields are 0.7 to 2 times as
-    large in the median. It is never below what rounding hides: 3e-8 of the rms visibility over that root.
+    `error_jy` is the rms of what the solution leaves in the real or imaginary part of the visibilities times the root
+    of the diagonal of (A^H W A)^-1: right for noise, for sources that are close together or resolved too. The change of
+    apparent fluxes with time and baseline, which a constant flux cannot follow, counts as noise here; it is not
+    independent, and true errors of simulated fields are 0.7 to 2 times as large in the median. It is never below what
+    rounding hides: 3e-8 of the rms visibility.
     """
 
     names: tuple[str, ...]
@@ -46,7 +47,7 @@ class SourceFluxes:
     dec_rad: Float
     model_jy: Float  # (F, G, 4), what the sky has there
     stokes_jy: Float  # (F, G, 4)
-    error_jy: Float  # (F, 4), see below
+    error_jy: Float  # (F, G, 4)
     freq_hz: Float
     outcome: tuple[Outcome, ...]  # per channel
     iterations: int
@@ -59,10 +60,10 @@ class ForcedPhotometry(Component):
     the residual of the normal equations is below `accuracy` of its start.
     """
 
-    uv_range: tuple[float, float] | None = None
-    every: Annotated[int, Field(ge=1)] = 1
-    accuracy: Annotated[float, Field(gt=0, lt=1)] = 1e-10
-    iterations: Annotated[int, Field(ge=1)] = 200
+    uv_range: UvRange | None = None
+    every: Count = 1
+    accuracy: Annotated[float, Real(above=0, below=1)] = 1e-10
+    iterations: Count = 200
 
     def measure(self, visibilities: Visibilities | Iterable[Visibilities], sky: PointSky) -> SourceFluxes:
         """Fluxes of the sources of `sky` in visibilities, or in blocks of them."""
@@ -103,10 +104,13 @@ class _Channel:
     power: Float = field(default_factory=lambda: np.zeros(4))  # sum of w |V|^2
     count: int = 0
 
-    def error(self, flux: Float) -> Float:
-        """Error of the fluxes (4,), from |V - A f|^2 = |V|^2 - f . A^H V at the solution; NaN without data."""
+    def error(self, flux: Float, spread: Float) -> Float:
+        """Errors of the fluxes (G, 4), from |V - A f|^2 = |V|^2 - f . A^H V at the solution and diag (A^H W A)^-1 (G,).
+
+        Of 2 n real data as many degrees of freedom are gone as there are groups.
+        """
         left = np.maximum(self.power - (flux * self.right).sum(axis=0), ROUNDING * self.power)
-        return np.sqrt(left / 2 / (self.total * self.count or np.nan))
+        return np.sqrt(np.multiply.outer(spread, left / max(2 * self.count - len(spread), 1)))
 
 
 class PhotometrySums:
@@ -214,54 +218,69 @@ class PhotometrySums:
             raise InputError("no visibilities were given to measure fluxes in")
         freqs = np.array(sorted(self.channels))
         channels = [self.channels[float(freq)] for freq in freqs]
-        fluxes, outcomes, counts = zip(*(self._solve(channel) for channel in channels), strict=True)
+        fluxes, spreads, outcomes, counts = zip(*(self._solve(channel) for channel in channels), strict=True)
         return SourceFluxes(
             names=self.names,
             ra_rad=self.sky.ra_rad[self.first],
             dec_rad=self.sky.dec_rad[self.first],
             model_jy=np.stack([_gathered(s, self.group, len(self.first)) for s in self.sky.stokes(freqs)]),
             stokes_jy=np.stack(fluxes),
-            error_jy=np.stack([channel.error(flux) for channel, flux in zip(channels, fluxes, strict=True)]),
+            error_jy=np.stack(
+                [c.error(flux, spread) for c, flux, spread in zip(channels, fluxes, spreads, strict=True)]
+            ),
             freq_hz=freqs,
             outcome=outcomes,
             iterations=max(counts),
         )
 
-    def _solve(self, channel: _Channel) -> tuple[Float, Outcome, int]:
-        nothing = np.full((len(self.first), 4), np.nan)
+    def _solve(self, channel: _Channel) -> tuple[Float, Float, Outcome, int]:
+        """Fluxes (G, 4), diag (A^H W A)^-1 (G,), how it ended, iterations."""
+        nothing = np.full((len(self.first), 4), np.nan), np.full(len(self.first), np.nan)
         if channel.total <= 0:
-            return nothing, Outcome.REFUSED, 0
+            return *nothing, Outcome.REFUSED, 0
         if not np.isfinite(channel.right).all():
-            return nothing, Outcome.NON_FINITE, 0
-        if all(slot.plain for slot in channel.slots) and len(self.group) <= MOST_DIRECT:
-            flux = _positive_solve(self._psf_matrix(channel), channel.right)
-            return (nothing, Outcome.SINGULAR, 0) if flux is None else (flux, Outcome.CONVERGED, 0)
-        # conjugate gradients share a flux between groups that cannot be told apart, and converge
-        if 2 * channel.count < len(self.first) or self._coincide(channel):
-            return nothing, Outcome.SINGULAR, 0
-        return self._conjugate_gradients(channel)
+            return *nothing, Outcome.NON_FINITE, 0
+        if 2 * channel.count < len(self.first):
+            return *nothing, Outcome.SINGULAR, 0
+        if len(self.group) > MOST_DIRECT:
+            # conjugate gradients share a flux between groups that cannot be told apart, and converge
+            if self._coincide(channel):
+                return *nothing, Outcome.SINGULAR, 0
+            flux, outcome, count = self._conjugate_gradients(channel)
+            return flux, np.full(len(flux), 1 / channel.total), outcome, count
+        plain = all(slot.plain for slot in channel.slots)
+        found = positive_solve(self._psf_matrix(channel) if plain else self._sampled(channel), channel.right)
+        if found is None:
+            return *nothing, Outcome.SINGULAR, 0
+        flux, spread = found
+        if plain:
+            return flux, spread, Outcome.CONVERGED, 0
+        flux, outcome, count = self._conjugate_gradients(channel)
+        return flux, spread, outcome, count
+
+    def _sampled(self, channel: _Channel) -> Float:
+        """PSF between all groups (G, G) of any weights, from some of the integrations: all within 1e11 products."""
+        groups, shaped = len(self.first), self.sky.gaussian
+        baselines = len(channel.slots[0].antenna1)
+        fewest = max(4, 4 * groups // baselines)  # twice as many real data as groups, or they look dependent
+        count = min(max(int(PRODUCTS / (baselines * groups**2)), fewest), len(channel.slots))
+        out, total = np.zeros((groups, groups)), 0.0
+        for i in np.linspace(0, len(channel.slots) - 1, count).round().astype(int):
+            slot = channel.slots[i]
+            z = self._fringes(slot)
+            each = z[slot.antenna1] * z[slot.antenna2].conj()
+            if shaped.any():
+                each[:, shaped] = self._pattern(slot, z)
+            columns = _gathered((each * slot.mix).T, self.group, groups) * np.sqrt(slot.weight)
+            out += columns.real @ columns.real.T + columns.imag @ columns.imag.T
+            total += float(slot.weight.sum()) * (len(slot.antenna1) if slot.plain else 1)
+        return out * (channel.total / total)
 
     def _coincide(self, channel: _Channel) -> bool:
-        """Whether groups of sources at the same places, with the same shapes, are linearly dependent."""
-        from scipy.sparse import coo_matrix
-        from scipy.sparse.csgraph import connected_components
-        from scipy.spatial import KDTree
-
         assert self.lmn is not None and self.axes is not None
         longest = max(float((np.linalg.norm(s.uvw, axis=1) * (s.weight > 0)).max()) for s in channel.slots)
-        if longest == 0:
-            return len(self.first) > 1
-        sources = len(self.group)
-        where = np.concatenate([self.lmn, self.axes.reshape(sources, 6)], axis=1)
-        near = KDTree(where).query_pairs(CLOSE / longest, output_type="ndarray")
-        places = connected_components(coo_matrix((np.ones(len(near)), near.T), (sources, sources)))[1]
-        groups = np.unique(self.group[near])
-        shares = coo_matrix((channel.mix, (self.group, places)), (len(self.first), sources)).tocsr()[groups]
-        if len(groups) < 2 or len(groups) > len(np.unique(shares.indices)):
-            return len(groups) > 1
-        gram = (shares @ shares.T).toarray()
-        scale = np.sqrt(gram.diagonal())
-        return bool(np.linalg.eigvalsh(gram / scale / scale[:, None])[0] < 1e-9)
+        where = np.concatenate([self.lmn, self.axes.reshape(len(self.group), 6)], axis=1)
+        return coincide(where, longest, self.group, channel.mix)
 
     def _psf_matrix(self, channel: _Channel) -> Float:
         """PSF between all groups, (G, G), for plain slots: sum_{a<b} Re x_a x_b^* = (|sum_a x_a|^2 - A) / 2."""
@@ -308,25 +327,6 @@ class PhotometrySums:
             direction = residual + np.divide(new, power, out=np.zeros(4), where=power > 0) * direction
             power = new
         return flux, Outcome.ITERATION_LIMIT, self.settings.iterations
-
-
-def _positive_solve(matrix: Float, right: Float) -> Float | None:
-    """matrix^-1 right by Cholesky; `None` where the matrix is singular (condition above 1e10), which it overwrites."""
-    from scipy.linalg import LinAlgError, cho_factor, cho_solve, lapack
-
-    # parts of a patch that nearly cancel make its row large: that alone is no singularity
-    scale = np.sqrt(matrix.diagonal())
-    if not np.all(scale > 0):
-        return None
-    matrix /= scale
-    matrix /= scale[:, None]
-    size = np.abs(matrix).sum(axis=0).max()
-    try:
-        factor = cho_factor(matrix, lower=True)
-    except LinAlgError:
-        return None
-    reciprocal, _ = lapack.dpocon(factor[0], size, uplo="L")
-    return cho_solve(factor, right / scale[:, None]) / scale[:, None] if reciprocal > 1e-10 else None
 
 
 def _groups(sky: PointSky) -> tuple[Int, Int, tuple[str, ...]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, Literal
 
@@ -28,7 +28,8 @@ LARGEST = 1e100  # squares of what is larger, or smaller than 1/LARGEST, leave f
 class Separation:
     """What a remover found in maps (F, Ny, Nx): how it ended, one line about it, the foreground in one of two forms.
 
-    Either `foreground` (F, Ny, Nx) itself, or an `operator` (F, F) with foreground = operator @ maps + `offset` (F,).
+    Either `foreground` (F, Ny, Nx) itself, or an `operator` (F, F) with foreground = operator @ maps + `offset` (F,);
+    `basis` (F, n) are orthonormal spectra with operator = basis basis^T, where there are.
     `mixing` (F, n) are the spectra of `components` (n, Ny, Nx); n may be 0. `adapted` is whether the operator was
     chosen by looking at the maps: the score then has to measure how much of the noise was fitted. `covariance` (F, F)
     is the posterior covariance of the foreground of a pixel, where there is one.
@@ -40,6 +41,7 @@ class Separation:
     components: Any
     foreground: Any = None
     operator: Float | None = None
+    basis: Float | None = None
     offset: Float | None = None
     adapted: bool = True
     covariance: Float | None = None
@@ -56,10 +58,10 @@ class Separation:
         if self.foreground is not None:
             return self.foreground
         assert self.operator is not None, "a Separation needs its foreground or an operator"
-        low_rank = 0 < self.mixing.shape[1] < len(maps) // 2 and self.offset is None
-        if low_rank and len(self.components) == self.mixing.shape[1]:
-            return apply(self.mixing, self.components)  # 2 n instead of F products a voxel
-        out = apply(self.operator, maps)
+        if self.basis is not None and 0 < self.basis.shape[1] < len(maps) // 2:
+            out = apply(self.basis, apply(self.basis.T, maps))  # 2 n instead of F products a voxel
+        else:
+            out = apply(self.operator, maps)
         if self.offset is not None:
             out += self.offset.astype(out.dtype)[:, None, None] * maps.any(axis=0)
         return out
@@ -274,6 +276,7 @@ class ForegroundRemover(Component):
         if found.mixing.shape[1] >= len(clean.channels):
             text = f"{found.mixing.shape[1]} components of {len(clean.channels)} channels are everything: residual 0"
             warnings.warn(text, InstrumentWarning, stacklevel=2)
+            found = replace(found, outcome=Outcome.SINGULAR, remark=f"{text}, which says nothing; ask for fewer")
         shown = found.of(clean.maps[:, :1]) if found.foreground is None else found.foreground
         if not np.isfinite(shown).all():
             text = f"the foreground came out as NaN, nothing was taken away ({found.remark})"

@@ -30,6 +30,7 @@ from instrument.units import Bool, Float
 NOISE_FROM = 0.3  # 1/Mpc: delays beyond it hold noise
 PROBES = 32  # spectra of those delays in which the noise of each cell is measured: to 18 %, their sum to far better
 DRAW = 0.3  # of the noise, added to see what an adapted remover makes of it: a smaller one scatters more
+UNSURE = 0.3  # of a score: a scatter beyond which a second draw is made
 LEAST = 4  # delays of noise
 RIDGE = 1e-2  # of the least squares for the noise of channels, towards their mean
 
@@ -102,27 +103,35 @@ def estimated_score(
     noise_here = noise[cells]
     level = np.trace(modes.T @ (scale[:, None] * modes))
     before = _powers(modes, maps, cells) - noise_here * level
+    # |DFT|^2 of a real image: each cell of the half plane is independent
+    n, spread = before.size, float(np.sqrt(before.size) * before.std())
+    bound = bool(before.sum() < 2 * spread)
+    total = max(float(before.sum()), 2 * spread)
+    if not total > 0:
+        raise InputError("the cube has no power at these delays: there is nothing to score")
+
+    def drawn(seed: int) -> Float:
+        draw = _draw(noise, scale, maps, seed)
+        moved = again(maps + draw.dtype.type(DRAW) * draw) - found if again else None
+        one, two = _spectra(modes, draw, cells), _spectra(modes, moved, cells)
+        fitted = (one.real * two.real + one.imag * two.imag).sum(axis=0) / DRAW
+        return np.asarray(_powers(modes, maps - found - moved, cells) - noise_here * level + 2 * fitted)
+
+    def valued(left: Float) -> tuple[float, float]:
+        value = float(left.sum() / total)
+        return value, float(np.sqrt(n) * (left - value * before).std() / total)
+
     if again is None:
         assert operator is not None
         fitted = noise_here * np.trace(modes.T @ operator @ (scale[:, None] * modes))
         how = "estimated; noise fitted: trace of the operator"
+        value, sigma = valued(_powers(modes, maps - found, cells) - noise_here * level + 2 * fitted)
     else:
-        drawn = _draw(noise, scale, maps, seed)
-        moved = again(maps + drawn.dtype.type(DRAW) * drawn) - found
-        found = found + moved
-        one, two = _spectra(modes, drawn, cells), _spectra(modes, moved, cells)
-        fitted = (one.real * two.real + one.imag * two.imag).sum(axis=0) / DRAW
         how = f"estimated; noise fitted: from one draw, seed {seed}"
-    left = _powers(modes, maps - found, cells) - noise_here * level + 2 * fitted
-    # |DFT|^2 of a real image: each cell of the half plane is independent
-    n, total, error = before.size, before.sum(), left.sum()
-    spread = float(np.sqrt(n) * before.std())
-    bound = bool(total < 2 * spread)
-    total = max(float(total), 2 * spread)
-    if not total > 0:
-        raise InputError("the cube has no power at these delays: there is nothing to score")
-    value = float(error / total)
-    sigma = float(np.sqrt(n) * (left - value * before).std() / total)
+        value, sigma = valued(left := drawn(seed))
+        if sigma > UNSURE * abs(value):
+            how = f"estimated; noise fitted: from two draws, seeds {seed} and {seed + 1}"
+            value, sigma = valued((left + drawn(seed + 1)) / 2)
     power = float((before + noise_here * level).sum())
     return Score(max(value, 0.0), sigma, how, bound, total / power if power else 0.0)
 

@@ -5,16 +5,16 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator
 
 from instrument.errors import Outcome
 from instrument.foreground.base import ForegroundRemover, Separation
 from instrument.foreground.linear import leading, projection
 from instrument.observe.directions import LIGHT
-from instrument.units import FINITE, Float, to_si
+from instrument.units import NOT_NEGATIVE, Float, Real, to_si
 
 Depth = Annotated[
-    float, BeforeValidator(lambda x: to_si(x, "rad/m2", "depth") if hasattr(x, "unit") else FINITE.check(x, "depth"))
+    float, NOT_NEGATIVE, BeforeValidator(lambda x: to_si(x, "rad/m2", "depth") if hasattr(x, "unit") else x)
 ]
 
 
@@ -25,8 +25,8 @@ class FaradayFilter(ForegroundRemover):
     x = 2 depth (lambda^2 - lambda'^2), above `keep` of the largest eigenvalue.
     """
 
-    depth: Annotated[Depth, Field(ge=0, allow_inf_nan=False)] = 3.0
-    keep: Annotated[float, Field(gt=0, lt=1)] = 1e-9
+    depth: Depth = 3.0
+    keep: Annotated[float, Real(above=0, below=1)] = 1e-9
 
     def separate(self, maps: Any, freq_hz: Float) -> Separation:
         """Foreground V V^T X."""

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
 from instrument.errors import Outcome
 from instrument.foreground.base import ForegroundRemover, Separation
 from instrument.foreground.linear import covariance, one_thread
-from instrument.units import Float
+from instrument.units import Count, Float
 
 # lengths in Hz of smooth emission, mode mixing and 21-cm signal (after Mertens et al. 2018, MNRAS 478, 3640)
 LENGTHS = ((10e6, 300e6), (1e6, 10e6), (0.2e6, 1.5e6))
@@ -30,7 +29,7 @@ class GaussianProcess(ForegroundRemover):
     mixing 1 to 10, the signal 0.2 to 1.5.
     """
 
-    iterations: Annotated[int, Field(ge=1)] = 200
+    iterations: Count = 200
 
     def separate(self, maps: Any, freq_hz: Float) -> Separation:
         """Posterior mean of the foreground."""

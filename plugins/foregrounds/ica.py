@@ -7,12 +7,11 @@ from dataclasses import replace
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from pydantic import Field
 
 from instrument.errors import Outcome, PluginError
 from instrument.foreground.base import ForegroundRemover, Separation
 from instrument.foreground.linear import projection, seen
-from instrument.units import Float, Seed
+from instrument.units import Count, Float, Seed, Whole
 
 
 class FastICA(ForegroundRemover):
@@ -23,8 +22,8 @@ class FastICA(ForegroundRemover):
 
     needs: ClassVar[dict[str, str]] = {"sklearn": "scikit-learn"}
 
-    components: Annotated[int, Field(ge=0)] = 4
-    iterations: Annotated[int, Field(ge=1)] = 200
+    components: Annotated[int, Whole(at_least=0)] = 4
+    iterations: Count = 200
     seed: Seed = 0
 
     def separate(self, maps: Any, freq_hz: Float) -> Separation:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import Field
+import numpy as np
 
 from instrument.errors import Outcome
 from instrument.foreground.base import ForegroundRemover, Separation
 from instrument.foreground.linear import principal, projection
-from instrument.units import Float
+from instrument.units import Float, Whole
 
 
 class PCA(ForegroundRemover):
@@ -18,12 +18,17 @@ class PCA(ForegroundRemover):
     An image of an interferometer has no mean; a mean map would count as one more component.
     """
 
-    components: Annotated[int, Field(ge=0)] = 4
+    components: Annotated[int, Whole(at_least=0)] = 4
 
     def separate(self, maps: Any, freq_hz: Float) -> Separation:
         """Foreground V V^T X."""
         n = min(self.components, len(maps))
-        values, vectors = principal(maps, n)
-        shares = ", ".join(f"{v / values[0]:.1e}" for v in values[:8]) + (", ..." if n > 8 else "")
+        values, vectors = principal(maps, min(n + 1, len(maps)))
+        vectors = vectors[:, :n]
+        shares = ", ".join(f"{v / values[0]:.1e}" for v in values[: min(n, 8)]) + (", ..." if n > 8 else "")
         remark = f"{n} principal components, eigenvalues {shares} of the largest" if n else "no component"
-        return projection(maps, vectors, Outcome.CONVERGED, remark)
+        outcome = Outcome.CONVERGED
+        eps = float(np.finfo(maps.dtype).eps)
+        if 0 < n < len(maps) and values[n] > max((1 - 100 * eps) * values[n - 1], (1000 * eps) ** 2 * values[0]):
+            outcome, remark = Outcome.SINGULAR, f"{remark}; the next is as strong: rounding decides which is taken"
+        return projection(maps, vectors, outcome, remark)

@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field
 
 from instrument.errors import Outcome
 from instrument.foreground.base import ForegroundRemover, Separation
 from instrument.foreground.linear import projection
-from instrument.units import Float
+from instrument.units import Float, Whole
 
 
 class Polynomial(ForegroundRemover):
@@ -20,7 +19,7 @@ class Polynomial(ForegroundRemover):
     condition of 1e28 for four terms.
     """
 
-    terms: Annotated[int, Field(ge=0)] = 4
+    terms: Annotated[int, Whole(at_least=0)] = 4
 
     def separate(self, maps: Any, freq_hz: Float) -> Separation:
         """Foreground Q Q^T X."""

@@ -308,7 +308,7 @@ def test_a_loss_is_written_as_a_table(signal, tmp_path):
     back = QTable.read(tmp_path / "loss.ecsv")
     assert len(back) == (loss.count > 0).sum() and back["k_par"].unit == u.Mpc**-1
     np.testing.assert_allclose(back["transfer"], loss.transfer[loss.count > 0])
-    assert "Polynomial" in back.meta["remover"]
+    assert "polynomial" in back.meta["remover"]
 
 
 def test_a_signal_that_does_not_fit_is_refused(signal):

@@ -158,7 +158,7 @@ def test_error_of_fluxes_is_the_noise_when_there_is_noise():
         gaps.append(found.stokes_jy[0] - sky.stokes_jy)
     # Stokes parameters are means of two correlations, so each part has sigma / sqrt 2; a flux uses the real part only
     count = vis.data.shape[0] * vis.data.shape[2]
-    assert np.mean(errors, axis=0) == pytest.approx([sigma / np.sqrt(2 * count)] * 4, rel=0.02)
+    assert np.mean(errors, axis=0) == pytest.approx(np.full((10, 4), sigma / np.sqrt(2 * count)), rel=0.02)
     assert np.std(gaps) == pytest.approx(sigma / np.sqrt(2 * count), rel=0.15)
 
 

@@ -52,7 +52,16 @@ def leakage_on_grid(near_null=(0, 3), expected=True, scale=1.0) -> Leakage:
     percent = 100 * np.stack([stokes[:, 1], stokes[:, 3]], axis=1) / 0.3
     names = tuple(f"s{k}" for k in range(25))
     return Leakage(
-        names, ra, dec, distance, model, stokes, np.full(4, 1e-9), 150e6, null, percent * 1.1 if expected else None
+        names,
+        ra,
+        dec,
+        distance,
+        model,
+        stokes,
+        np.full((25, 4), 1e-9),
+        150e6,
+        null,
+        percent * 1.1 if expected else None,
     )
 
 
@@ -145,7 +154,7 @@ def test_one_source_at_the_centre_is_drawn():
     keep = leakage.distance_rad < 1e-6
     one = Leakage(
         **{k: v[keep] if isinstance(v, np.ndarray) and len(v) == 25 else v for k, v in vars(leakage).items()}
-        | {"names": ("s12",), "error_jy": leakage.error_jy}
+        | {"names": ("s12",)}
     )
     assert len(figures.bubbles(one, CENTRE).collections[0].get_offsets()) == 1
     figures.profile(one)
