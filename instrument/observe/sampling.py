@@ -50,7 +50,13 @@ class Sampling:
     @classmethod
     @checked
     def build(
-        cls, layout: Layout, times: Any, freq_hz: Float, ra_rad: Float, dec_rad: Float, centre: Direction
+        cls,
+        layout: Layout,
+        times: Any,
+        freq_hz: Float | float,
+        ra_rad: Float | float,
+        dec_rad: Float | float,
+        centre: Direction,
     ) -> Sampling:
         """Sampling at astropy `times` (T,), for ICRS directions (S,) in rad; all finite, frequencies positive."""
         times = instants(times)
@@ -62,8 +68,8 @@ class Sampling:
             earth=earth_frame(times, layout.centre_m),
             slots_s=mjd_seconds(times),
             freq_hz=freq_hz,
-            ra_rad=np.atleast_1d(plain(ra_rad, float, "right ascension of directions", finite=True)),
-            dec_rad=np.atleast_1d(plain(dec_rad, float, "declination of directions", finite=True)),
+            ra_rad=np.atleast_1d(plain(ra_rad, float, "ra_rad", finite=True)),
+            dec_rad=np.atleast_1d(plain(dec_rad, float, "dec_rad", finite=True)),
             centre=centre,
         )
 

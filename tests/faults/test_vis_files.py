@@ -2,7 +2,7 @@
 
 import os
 import tracemalloc
-from types import SimpleNamespace
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -10,11 +10,12 @@ import pytest
 from astropy import units as u
 from astropy.coordinates import SkyCoord
 
-from instrument import DirectionalCal, JonesTable, Layout, Observation, PointSky, Scene
+from instrument import DirectionalCal, JonesTable, Layout, Observation, PointSky, Sampling, Scene
 from instrument.calibrate.directional import DirectionalSolution
 from instrument.errors import FileError, InputError
 from instrument.files.solutions import read_h5parm, write_h5parm
 from instrument.model import Composed
+from instrument.units import Direction
 from instrument.whole_file import whole_file, write_ecsv
 
 NAMES = ("CS001HBA0", "CS003HBA1", "RS106HBA")
@@ -29,17 +30,12 @@ def table(seed=0):
 
 
 def at(seconds=0.0, freq_hz=149e6):
-    """What a table asks of a sampling, at a time after the first slot and a frequency."""
-    return SimpleNamespace(
-        layout=NAMES_ONLY, slots_s=np.atleast_1d(SLOTS[0] + seconds), freq_hz=np.atleast_1d(np.asarray(freq_hz, float))
-    )
+    """A sampling at a time after the first slot and some frequencies."""
+    enu = np.array([[0, 0, 0], [90, 10, 0], [30, 300, 0]]) * u.m
+    layout = Layout.from_enu(NAMES, enu, 6.9 * u.deg, 52.9 * u.deg, 0 * u.m)
+    one = Sampling.build(layout, "2012-12-07T20:00:00", freq_hz, 2.0, 0.8, Direction(2.0, 0.8))
+    return replace(one, slots_s=np.array([SLOTS[0] + seconds]))
 
-
-class _Names(tuple):
-    names = NAMES
-
-
-NAMES_ONLY = _Names(NAMES)
 
 # I10: temporary files -----------------------------------------------------------------------------------------------
 
@@ -135,7 +131,7 @@ def calibrator(tmp_path):
 def test_c5_a_bandpass_without_a_time_axis_is_constant_in_time(calibrator):
     bandpass = read_h5parm(calibrator, soltabs=["bandpass"])
     for seconds in (0.0, 5e4, 1e8):
-        found = bandpass.jones(at(seconds, [149e6, 150e6]))
+        found = bandpass.jones(at(seconds, np.array([149e6, 150e6])))
         assert found.shape == (1, 2, 3, 1, 2, 2)
         assert np.array_equal(found[0, :, :, 0, 0, 0], (1 + np.arange(12.0).reshape(3, 2, 2)[:, :, 0]).T)
         assert np.array_equal(found[0, :, :, 0, 1, 1], (1 + np.arange(12.0).reshape(3, 2, 2)[:, :, 1]).T)

@@ -411,8 +411,8 @@ def test_b7_frequencies_of_an_observation(frequencies):
 @pytest.mark.parametrize(
     "change, name",
     [
-        ({"ra": np.nan}, "directions"),
-        ({"dec": np.inf}, "directions"),
+        ({"ra": np.nan}, "ra_rad"),
+        ({"dec": np.inf}, "dec_rad"),
         ({"freq": 0.0}, "freq_hz"),
         ({"freq": np.nan}, "freq_hz"),
     ],

@@ -192,7 +192,7 @@ def test_c3_linear_is_of_amplitude_and_phase(first, second, half, axis):
 
 def test_c3_full_matrices_turn_by_their_unitary_part_and_stretch_by_their_hermitian_part():
     rng = np.random.default_rng(1)
-    for _ in range(20):
+    for _ in range(8):
         first, second = np.eye(2) + 0.4 * (rng.normal(size=(2, 2, 2)) + 1j * rng.normal(size=(2, 2, 2)))
         for share in (0.2, 0.5, 0.9):
             found = between(first, second, share)
