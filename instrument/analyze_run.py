@@ -56,7 +56,13 @@ class Reading:
     def cube(self, paths: Sequence[str]) -> tuple[StokesCube, Float | None]:
         """The cube of the channels that are left, and their weights (F,)."""
         freq = None if self.frequencies is None else read_frequencies(self.frequencies)
-        cube = read_cube(*paths, stokes=self.stokes, unit=self.unit, frequencies=freq)
+        said: dict[str, Any] = {"stokes": self.stokes, "unit": self.unit, "frequencies": freq}
+        try:
+            cube = read_cube(*paths, **said)
+        except InputError as error:  # a beam of the header that cannot be: another one is given
+            if "psf=" not in str(error) or (self.beam is None and self.psf is None):
+                raise
+            cube = read_cube(*paths, **said, psf=Psf.gaussian("1 arcmin")).with_psf(None)
         count = len(cube.freq_hz)
         if self.psf is not None:
             if self.beam is not None:

@@ -13,6 +13,7 @@ from astropy.coordinates import FK4, SkyCoord
 from astropy.io import fits
 
 from instrument import InputError, Psf, StokesCube, polarized_screens, read_cube
+from instrument.cli import main
 from instrument.errors import FileError, InstrumentWarning, RefusedError
 
 F, N = 4, 16
@@ -390,3 +391,14 @@ def test_i8_a_table_of_beams_with_broken_keywords_is_one_line(path, key, value):
         assert "\n" not in str(error)
     else:
         assert found.psf is None or np.nanmax(np.abs(found.psf.major_rad - np.deg2rad(0.05))) < 1e-6
+
+
+def test_e5_a_beam_of_the_header_that_cannot_be_is_replaced_on_the_command_line(path, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    written(path, BMAJ=180.0, BMIN=180.0)
+    words = ["analyze", str(path), "--products", "spectrum-2d", "--out", str(tmp_path / "out")]
+    assert main(words) == 2
+    assert "wider than the image" in (said := capsys.readouterr().err)
+    assert "--beam" in said
+    assert "Traceback" not in said
+    assert main([*words, "--beam", "3 arcmin"]) == 0
