@@ -147,13 +147,13 @@ def test_f6_a_nan_is_the_worst_error_of_all(plan):
 
 @pytest.mark.parametrize("samples", [np.inf, np.nan, 0, -1, "2", 2.5, True, None])
 def test_f6_samples_are_counted(plan, samples):
-    with pytest.raises(InputError, match=r"^samples = .* must be a whole number of at least 1"):
+    with pytest.raises(InputError, match=r"^samples = .* must be (a whole number|at least 1)"):
         plan.verify(samples=samples)
 
 
 @pytest.mark.parametrize("seed", [np.inf, np.nan, -1, "2", True, None])
 def test_f6_a_seed_is_a_seed(plan, seed):
-    with pytest.raises(InputError, match=r"^seed = .* must be a whole number of at least 0"):
+    with pytest.raises(InputError, match=r"^seed = .* must be (a whole number|at least 0)"):
         plan.verify(seed=seed)
 
 
