@@ -21,6 +21,7 @@ import numpy as np
 from astropy import units as u
 
 from instrument import Analyzer, StokesCube, __version__
+from instrument.analyze.leakage import leakage_of
 from instrument.errors import InstrumentWarning
 
 Row = tuple[str, str, float]
@@ -147,7 +148,75 @@ def spectra(draws: int, seed: int = 0) -> list[Row]:
     return rows
 
 
-AREAS: dict[str, Callable[[int, int], list[Row]]] = {"faraday": faraday, "spectra": spectra}
+CORE = ["CS001HBA0", "CS002HBA0", "CS005HBA1", "CS011HBA0", "CS024HBA0", "CS028HBA1", "CS030HBA0", "CS103HBA1"]
+BEAM = 4.5e-4  # rad, 1 / longest baseline of those in wavelengths at 150 MHz
+
+
+def _field(apart, wide=0.0):
+    """Visibilities of two sources of 3 and 2 Jy, some polarized, `apart` beams from each other; and their sky."""
+    from astropy.coordinates import SkyCoord
+
+    import instrument
+    from instrument import Observation, PointSky, Scene
+
+    centre = SkyCoord("08h13m36.0s +48d13m03s")
+    shape = {k: np.full(2, wide * BEAM) for k in ("major_rad", "minor_rad")} | {"angle_rad": np.zeros(2)}
+    flux = np.array([[3, 0.3, 0.2, 0.1], [2, 0, 0.2, 0.1]])
+    where = centre.spherical_offsets_by([0, apart * BEAM] * u.rad, [0, 0] * u.rad)
+    sky = PointSky.at(where, flux, **(shape if wide else {}))
+    night = Observation(
+        phase_centre=centre, transit="2012-12-07", duration=8 * u.hour, interval=40 * u.min,
+        frequencies=[150] * u.MHz, channel_width=0.2 * u.MHz,
+    )  # fmt: skip
+    array = instrument.load("telescopes", "lofar-hba", beam=None, stations=CORE)
+    return Scene(instrument=array, sky=sky, observation=night).plan().run(), sky
+
+
+def sources(draws: int, seed: int = 0) -> list[Row]:
+    """Fluxes and leakages by forced photometry, fluxes and positions by offsets, under noise of the receivers."""
+    from instrument.analyze.offsets import OffsetSums
+    from instrument.analyze.photometry import ForcedPhotometry
+
+    rows: list[Row] = []
+    for case, apart, wide, sefd, flagged in (
+        ("two sources 30 beams apart", 30, 0, 300, False),
+        ("0.1 beam apart", 0.1, 0, 300, False),
+        ("0.01 beam apart", 0.01, 0, 300, False),
+        ("1e-4 beam apart", 1e-4, 0, 300, False),
+        ("0.1 beam apart, some data flagged", 0.1, 0, 300, True),
+        ("Gaussians of 5 beams, 5 beams apart", 5, 5, 300, False),
+    ):
+        vis, sky = _field(apart, wide)
+        if flagged:
+            vis = vis.flagged(np.random.default_rng(seed).random(vis.data.shape[:3]) < 0.1)
+        # without a source of its own polarization in the model, all that is seen is leakage
+        plain = sky.with_fields(stokes_jy=sky.stokes_jy * [1, 0, 0, 0])
+        pulls, leaks = [], []
+        for k in range(draws):
+            fluxes = ForcedPhotometry().measure(vis.with_noise(sefd * u.Jy, seed + k), plain)
+            pulls.append((fluxes.stokes_jy[0] - sky.stokes_jy) / fluxes.error_jy[0])
+            leak = leakage_of(fluxes, vis.phase_centre)
+            true = 100 * np.stack([np.hypot(*sky.stokes_jy[:, 1:3].T), sky.stokes_jy[:, 3]], 1) / sky.stokes_jy[:, :1]
+            found = np.stack([leak.linear_percent, leak.circular_percent], 1)
+            leaks.append((found - true) / leak.error_percent)
+        rows += [(case, f"Stokes {s}", float(np.std(np.array(pulls)[..., n]))) for n, s in enumerate("IQUV")]
+        if apart > 1 and not wide:
+            rows += [(case, f"{what} leakage", float(np.std(np.array(leaks)[..., n])))
+                     for n, what in enumerate(("linear", "circular"))]  # fmt: skip
+    for case, apart in (("two sources 30 beams apart", 30.0), ("3 beams apart", 3.0)):
+        vis, sky = _field(apart)
+        sigma = vis.noise_jy(300 * u.Jy) / np.sqrt(2)  # of one part of Stokes I
+        stokes = np.stack([vis.with_noise(300 * u.Jy, seed + k).stokes()[..., 0] for k in range(draws)])
+        total = OffsetSums(sky, np.arange(2))
+        total.add(vis, stokes)
+        flux, moved, spread = total.finish()
+        rows.append((case, "flux with position", float(np.std((flux - sky.stokes_jy[:, 0]) / (sigma * spread[:, 0])))))
+        rows += [(case, f"position in {x}", float(np.std(moved[..., n] / (sigma * spread[:, 1 + n]))))
+                 for n, x in enumerate("lm")]  # fmt: skip
+    return rows
+
+
+AREAS: dict[str, Callable[[int, int], list[Row]]] = {"faraday": faraday, "spectra": spectra, "sources": sources}
 
 
 def main() -> None:
