@@ -83,6 +83,8 @@ class Reading:
             outside = np.flatnonzero(~inside)
             unused("analyze", [f"channel {k}" for k in outside], f"outside of --band {self.band}")
             cube, weights = cube.channels(inside), None if weights is None else weights[inside]
+        if self.common_beam is not None:
+            cube = cube.at_common_beam(None if self.common_beam == "smallest" else self.common_beam)
         return cube, weights
 
     def quiet(self, cube: StokesCube) -> StokesCube | None:

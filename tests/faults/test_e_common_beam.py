@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 from astropy import units as u
 
-from instrument import Analyzer, InputError, Psf, StokesCube
+from instrument import Analyzer, CubeAnalysis, InputError, Psf, StokesCube
+from instrument.cli import main
 from instrument.errors import InstrumentWarning
 from instrument.image.common_beam import beam_ratio, common_beam, say_unequal_beams, shapes
 
 MHZ = [134, 150, 166] * u.MHz
+run = CubeAnalysis.run
 N, PIXEL = 64, 0.5
 
 
@@ -100,3 +102,16 @@ def test_e14_channels_without_a_beam_are_named():
         cube(psf=Psf.gaussian([4, np.nan, 3] * u.arcmin)).at_common_beam()
     with pytest.raises(InputError, match="a common beam needs the beams of the cube"):
         cube(psf=None).at_common_beam()
+
+
+@pytest.mark.parametrize(("words", "want"), [([], [4, 3]), (["5 arcmin"], [5, 5])])
+def test_e14_the_command_makes_them_equal(tmp_path, monkeypatch, words, want):
+    monkeypatch.chdir(tmp_path)
+    cube().write("a.fits")
+    given = []
+    monkeypatch.setattr(CubeAnalysis, "run", lambda self, one, *rest: given.append(one) or run(self, one, *rest))
+    settings = ["--products", "spectrum-2d", "--out", "out", "--common-beam", *words]
+    assert main(["analyze", "a.fits", *settings]) == 0
+    (found,) = given
+    assert np.rad2deg(found.psf.major_rad) * 60 == pytest.approx([want[0]] * 3)
+    assert np.rad2deg(found.psf.minor_rad) * 60 == pytest.approx([want[1]] * 3)
