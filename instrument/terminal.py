@@ -97,6 +97,10 @@ def process(work: Callable[[], int]) -> int:
         if not isinstance(_lost[0], BrokenPipeError):  # whoever reads a pipe may leave; a full disk loses text
             say(f"standard output: {_lost[0].strerror}")
             status = status or FAILED
+    try:
+        sys.stderr.flush()
+    except OSError:  # the same: Python would end with a status of its own
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
     return status
 
 

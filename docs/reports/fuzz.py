@@ -2,7 +2,7 @@
 
     python docs/reports/fuzz.py [COUNT] [SEED] [--dry]
 
-Every case is a forked process with limits (10 s of CPU, 2 GB). It must be done and whole, or refused in one line with
+Every case is a forked process with limits (20 s of CPU, 2 GB). It must be done and whole, or refused in one line with
 nothing left behind. `--dry` prints the faults alone and writes nothing.
 """
 
@@ -36,6 +36,8 @@ def run(count: int, seed: int) -> list[Verdict]:
             found.append(zygote.judge(case))
             if not found[-1].good:
                 print(f"{number}: {found[-1]}\n", flush=True)
+            if number % 100 == 99:
+                print(f"{number + 1} cases", flush=True)
     shutil.rmtree(folder, ignore_errors=True)
     return found
 
@@ -48,11 +50,11 @@ def report(found: list[Verdict], seed: int, seconds: float) -> str:
     lines = [
         "# Hostile input",
         "",
-        f"{total['cases']} mutated inputs (seed {seed}), each in a forked process with at most 10 s of CPU and 2 GB.",
+        f"{total['cases']} mutated inputs (seed {seed}), each in a forked process with at most 20 s of CPU and 2 GB.",
         "A case is right when it is done and its folder is whole and can be read back, or when it is refused in one",
         "line with status 2 and nothing left behind. Anything else is a fault: a traceback, the line of an unexpected",
         "error, a hang, too much memory, a file outside of its folder, a changed input, control characters. Long:",
-        "stopped after 10 s at work of which the plan had said that it takes as long.",
+        "stopped after 20 s at work of which the plan had said that it takes as long.",
         "",
         "| kind | cases | done | long | refused | faults | most CPU, s | most memory, MB |",
         "|---|---|---|---|---|---|---|---|",

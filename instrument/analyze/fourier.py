@@ -8,8 +8,9 @@ import numpy as np
 
 from instrument.errors import InputError, did_you_mean, warn
 from instrument.image.cube import StokesCube
+from instrument.numbers import Real
 from instrument.observe.directions import LIGHT
-from instrument.units import COUNT, POSITIVE, Complex, Float, Int, plain, to_si
+from instrument.units import COUNT, Complex, Float, Int, plain, to_si
 
 HYDROGEN = 1420405751.768  # Hz, the 21-cm line at rest
 Stokes = Literal["I", "Q", "U", "V", "P"]
@@ -87,11 +88,14 @@ def comoving(freq_hz: float, redshift: float | None, cosmology: Any) -> tuple[fl
     return float(z), float((cosmology or Planck15).comoving_transverse_distance(z).to_value("Mpc"))
 
 
+REDSHIFT = Real(above=0, at_most=1100)  # there was no neutral hydrogen before
+
+
 def check_redshift(redshift: Any, low_hz: float, high_hz: float) -> float | None:
     """The redshift given for a band, above 0; warns where its 21-cm line is further than 10 % from the band."""
     if redshift is None:
         return None
-    z = POSITIVE.check(redshift, "redshift")
+    z = REDSHIFT.check(redshift, "redshift")
     line = HYDROGEN / (1 + z)
     if not low_hz / 1.1 <= line <= high_hz * 1.1:
         band = f"{low_hz / 1e6:.4g}" + (f" to {high_hz / 1e6:.4g}" if high_hz > low_hz else "")

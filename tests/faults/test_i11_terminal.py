@@ -120,6 +120,11 @@ def test_i4_streams_that_are_full_or_closed(redirect, status, said):
     assert (done.returncode, done.stderr) == (status, said)
 
 
+def test_i4_an_error_that_cannot_be_said_keeps_its_status():
+    done = subprocess.run(["bash", "-c", f"{' '.join(LIGHT[:-1])} no-such-verb 2> /dev/full"], timeout=120)
+    assert done.returncode == 2
+
+
 def test_i4_a_terminal_of_ascii_is_no_error():
     env = os.environ | {"PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
     done = subprocess.run(

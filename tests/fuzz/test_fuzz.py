@@ -1,12 +1,12 @@
 """Hostile input of every kind is done whole or refused in one line: no traceback, hang, flood of memory or half folder.
 
-The default run takes a small sample; `long` some hundreds; `--fuzz 3000` thousands, with the seed `--fuzz-seed`.
+The default run takes a small sample; `long` 300; `--fuzz 3000` thousands, with the seed `--fuzz-seed`.
 """
 
 import pytest
 from fuzzing.choose import cases
 
-SAMPLE, LONG = 12, 400
+SAMPLE, LONG = 12, 300
 
 
 def faults(zygote, count, seed):
