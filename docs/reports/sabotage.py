@@ -62,13 +62,13 @@ def piece(blocks, plan, t, f):
 
 
 def hunt(plan, cases, rng):
-    """Cases found of each kind, the check of whole data, and the seconds of all cores for prediction and check."""
+    """Cases found and looked at of each kind, the check of whole data, processor seconds of prediction and check."""
     begin = time.process_time()
     blocks = list(plan.blocks())
     predicted = time.process_time() - begin
     times, channels, baselines = plan.problem.shape
     sizes = dict(zip(KINDS, (len(plan.problem.at.layout), baselines, times, channels), strict=True))
-    found = dict.fromkeys(KINDS, 0)
+    found, looked = dict.fromkeys(KINDS, 0), dict.fromkeys(KINDS, 0)
     for kind in KINDS:
         for seed in range(cases):
             checker = plan.watched(seed=seed).checker
@@ -76,11 +76,13 @@ def hunt(plan, cases, rng):
             for t, f in checker.chosen():  # of the blocks, what the check looks at
                 checker.see(flipped(piece(blocks, plan, t, f), kind, k, plan))
             found[kind] += not checker.result().passed
+            axis = {"time": 0, "channel": 1}.get(kind)
+            looked[kind] += axis is None or k in {cell[axis] for cell in checker.chosen()}
     watched = plan.watched(seed=0)
     begin = time.process_time()
     for block in blocks:
         watched.checker.see(block)
-    return found, watched.check, predicted, time.process_time() - begin
+    return found, looked, watched.check, predicted, time.process_time() - begin
 
 
 def main():
@@ -93,10 +95,13 @@ def main():
     few = replace(plan, problem=plan.problem.block(slice(0, 2), slice(None)))
     for _ in few.blocks():
         pass  # compiled
-    found, check, predicted, spent = hunt(plan, given.cases, np.random.default_rng(0))
+    found, looked, check, predicted, spent = hunt(plan, given.cases, np.random.default_rng(0))
     share = {"station": 1.0, "baseline": 1.0}
     share |= {"time": check.times.seen / check.times.of, "channel": check.channels.seen / check.channels.of}
-    rows = [f"| {kind} | {found[kind]} of {given.cases} | {share[kind] * given.cases:.1f} |" for kind in KINDS]
+    rows = [
+        f"| {kind} | {found[kind]} of {given.cases} | {looked[kind]} | {share[kind] * given.cases:.1f} |"
+        for kind in KINDS
+    ]
     text = f"""# Flipped signs in what an engine produced
 
 {date.today()}, {platform.machine()}, Python {platform.python_version()}, numpy {version("numpy")},
@@ -106,8 +111,8 @@ Made by `python docs/reports/sabotage.py --times {given.times} --channels {given
 59 stations, {given.times} times, {given.channels} channels, 4 sources. One thing has its sign turned in the data
 as they stream by; every case has its own seed. Unspoilt data: {check}.
 
-| flipped | found | due by the share that is printed |
-|---|---|---|
+| flipped | found | was looked at | due by the share that is printed |
+|---|---|---|---|
 """ + "\n".join(rows)
     text += f"""
 
