@@ -19,6 +19,7 @@ from instrument.analyze.fourier import (
     taper_of,
     uv_limits,
 )
+from instrument.analyze.modes import Modes
 from instrument.errors import InputError, InstrumentWarning
 from instrument.image.cube import StokesCube
 from instrument.units import Bool, Complex, Float, Int, one_si
@@ -71,7 +72,7 @@ class Cells:
     folds: Float
     v_index: Int  # (N,), place on the grid of the DFT of each cell, rows and columns
     u_index: Int
-    modes: float  # independent modes in each cell counted: 1/2 of a real field, fewer behind a taper
+    modes: Modes  # which cells are alike: behind a taper, or of both signs
     left_out: dict[str, int]
 
     def cylindrical(
@@ -167,7 +168,6 @@ def cells_of(
     scale = (distance * cube.pixel_rad) ** 2 * depth * (grid_hz[1] - grid_hz[0]) / (n * ny * nx * square)
     folds = _both_signs(n)
     power, auto = _delays(spectra, along, folds, scale)
-    alike = square**2 / float((window**4).mean() * (along**4).mean())
     frame = Frame(
         cube.unit, stokes, freq, z, distance, depth, taper, taper_space, uv_range and (low, high),
         1 - float(has.mean()), int((~here).sum()), psf_corrected,
@@ -179,10 +179,10 @@ def cells_of(
             row[:] = row[rising]
     use = use[rising]
     k_perp = uv.ravel()[use] * 2 * np.pi / distance
-    modes = alike * (0.5 if half else 1.0)
     row, column = np.divmod(use, len(columns))
+    step = *(2 * np.pi / (distance * n * cube.pixel_rad) for n in (ny, nx)), float(k_par[1])
     places = times.ravel()[use], folds, row, columns[column]
-    return Cells(frame, k_perp, k_par, power, auto, *places, modes, left_out)
+    return Cells(frame, k_perp, k_par, power, auto, *places, Modes(window, along, step, half), left_out)
 
 
 def _both_signs(n: int) -> Float:

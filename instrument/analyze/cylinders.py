@@ -215,7 +215,7 @@ def cylindrical(
         _divided(cells.sums(bounds, cells.k_perp), each),
         _divided(k_par, folds),
         power,
-        _sigma(power, _divided(both, count), count, cells),
+        _sigma(power, _divided(both, count), cells.modes.cylindrical(cells, perp, bounds, rows, shape[1])),
         count,
         perp,
         par,
@@ -261,7 +261,7 @@ def spherical(cells: Cells, bins: Any = 15, log: bool = True, wedge: Any = None,
     if wedge is not None or k_par_min is not None:
         left_out["in the wedge, or below k_par_min"] = round(in_wedge)
     left_out["k = 0, or outside all bins"] = round(cells.folds.sum() * upto[-1] - in_wedge - weight.sum())
-    sigma = _sigma(power, _divided(both, count), count, cells)
+    sigma = _sigma(power, _divided(both, count), cells.modes.spherical(cells, edges, bounds, slope, least))
     return Spherical(_divided(k_sum, count), power, sigma, count, edges, cells.frame, left_out, cells, bounds)
 
 
@@ -318,9 +318,8 @@ def _divided(sums: Any, count: Any) -> Float:
     return np.divide(sums, count, out=np.full(np.shape(sums), np.nan), where=np.asarray(count) > 0)
 
 
-def _sigma(power: Float, auto: Float, count: Int, cells: Cells) -> Float:
+def _sigma(power: Float, auto: Float, modes: Float) -> Float:
     """Scatter of a Gaussian field: power over the root of the modes; across two cubes, from all three powers."""
-    modes = np.maximum(count * cells.modes, np.minimum(count, 1))
     size = power if auto is power else np.sqrt((power**2 + auto**2) / 2)
     return _divided(size, np.sqrt(modes))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -21,10 +22,11 @@ from instrument.analyze.fourier import (
     taper_of,
     uv_limits,
 )
+from instrument.analyze.modes import independent, some
 from instrument.checked import checked
 from instrument.errors import InputError, InstrumentWarning
 from instrument.image.cube import StokesCube
-from instrument.units import Float, Int
+from instrument.units import Bool, Float, Int
 from instrument.whole_file import write_ecsv
 
 
@@ -36,7 +38,7 @@ class Spectrum2D:
     `k_perp` (1/Mpc) and `uv` (wavelengths) are means over the `count` cells of the Fourier plane in a bin
     `edges[i] <= k < edges[i+1]`, the last one closed; both signs of k count, the cell k = 0 never. Without cells all
     are NaN. `sigma` is power over the root of the independent modes: the scatter of a Gaussian field that fills the
-    image (count/2 modes of a real field, count of Q + iU, fewer behind a taper). The PSF is in the power.
+    image (count/2 modes of a real field, count of Q + iU, fewer behind a taper or a hole). The PSF is in the power.
     """
 
     k_perp: Float
@@ -124,10 +126,25 @@ def spectrum_2d(
     k, edges = uv * scale, bin_edges((low or uv.min()) * scale, top * scale, bins, log)
     count, (k_mean, uv_mean, mean) = bin_means(k, edges, weight, k, uv, variance[use])
     power = mean * image.size * (distance * cube.pixel_rad) ** 2  # area / pixels^2 |DFT|^2
-    # a window makes neighbouring cells alike: mean(w^4)/mean(w^2)^2 of them are one
-    modes = count * (1.0 if stokes == "P" else 0.5)
-    modes = np.maximum(modes * (window**2).mean() ** 2 / (window**4).mean(), np.minimum(modes, 1))
+    row, column = np.nonzero(use)
+    cells = [(row[k], column[k], 0 * k, weight[k]) for k in _some_of_bins(k, edges)]
+
+    def inside(b: int, y: Int, x: Int, _: Int) -> Bool:
+        there = np.hypot(v[y], u[x]) * scale
+        within = (there > 0) & (there >= low * scale) & (there <= high * scale) & (there >= edges[b])
+        return within & ((there < edges[b + 1]) | ((b == len(edges) - 2) & (there <= edges[b + 1])))
+
+    modes = independent(window, np.ones(1), cells, count.astype(float), inside) / (1 if stokes == "P" else 2)
     about = cube.unit, stokes, float(cube.freq_hz[channel]), z, distance, uv_range and (low, high), taper
     return Spectrum2D(
         k_mean, uv_mean, power, power / np.sqrt(modes), count, edges, *about, missing=1 - float(has.mean())
     )
+
+
+def _some_of_bins(k: Float, edges: Float) -> list[Int]:
+    """Places of the cells of each bin among k (N,), of a large bin of some by chance."""
+    index = np.where(k == edges[-1], len(edges) - 2, np.searchsorted(edges, k, side="right") - 1)
+    order = np.argsort(index, kind="stable")
+    bounds = np.searchsorted(index[order], np.arange(len(edges)))
+    parts = (order[a:b] for a, b in pairwise(bounds))
+    return [part[some(len(part), seed)] for seed, part in enumerate(parts)]
