@@ -84,7 +84,10 @@ class Reading:
             unused("analyze", [f"channel {k}" for k in outside], f"outside of --band {self.band}")
             cube, weights = cube.channels(inside), None if weights is None else weights[inside]
         if self.common_beam is not None:
-            cube = cube.at_common_beam(None if self.common_beam == "smallest" else self.common_beam)
+            try:
+                cube = cube.at_common_beam(None if self.common_beam == "smallest" else self.common_beam)
+            except InputError as error:
+                raise InputError(f"--common-beam: {error}") from None
         return cube, weights
 
     def quiet(self, cube: StokesCube) -> StokesCube | None:

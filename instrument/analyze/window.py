@@ -13,7 +13,7 @@ from instrument.analyze.fourier import per_mpc
 from instrument.analyze.signal import Signal21cm
 from instrument.checked import checked
 from instrument.errors import InputError
-from instrument.units import FINITE, Bool, Float
+from instrument.units import FINITE, Bool, Float, Share
 from instrument.whole_file import write_ecsv
 
 
@@ -43,15 +43,15 @@ class EoRWindow:
         """Bins that are known and above the wedge (P, L)."""
         return ~self.unknown & ~self.wedge
 
-    def ratio(self, removed: float = 0.0) -> Float:
+    def ratio(self, removed: Share = 0.0) -> Float:
         """Power of leakage and noise over that of the signal (P, L): 1 is the rim of the window."""
-        return (self.leakage.power * (1 - _share(removed)) ** 2 + self.noise) / self.signal
+        return (self.leakage.power * (1 - removed) ** 2 + self.noise) / self.signal
 
-    def mask(self, removed: float = 0.0) -> Bool:
+    def mask(self, removed: Share = 0.0) -> Bool:
         """Where the window is open (P, L)."""
         return self.counts & (np.nan_to_num(self.ratio(removed), nan=np.inf) < 1)
 
-    def area(self, removed: float = 0.0) -> tuple[float, float]:
+    def area(self, removed: Share = 0.0) -> tuple[float, float]:
         """Area of the window in ln k_perp ln k_par, and its share of the area of all bins that count."""
         perp, par = (np.log(np.maximum(e, 1e-12)) for e in (self.leakage.perp_edges, self.leakage.par_edges))
         each = np.multiply.outer(np.diff(perp), np.diff(par))
@@ -59,7 +59,7 @@ class EoRWindow:
         found = float(each[self.mask(removed)].sum())
         return found, found / whole if whole else 0.0
 
-    def reach(self, removed: float = 0.0, share: float = 1.0) -> tuple[float, float]:
+    def reach(self, removed: Share = 0.0, share: Share = 1.0) -> tuple[float, float]:
         """From and up to which k_par (1/Mpc) the window is open at all k_perp, or at a `share` of those that count.
 
         The longest run of rows of bins in ln k_par; NaN, NaN where no row is.
@@ -156,9 +156,3 @@ def eor_window(
     power = leakage.average(signal.power_or_nan)
     flat = np.zeros(leakage.power.shape) if noise is None else noise.power
     return EoRWindow(leakage, power, flat, below, signal)
-
-
-def _share(removed: float) -> float:
-    if not 0 <= removed <= 1:
-        raise InputError(f"removed = {removed} must be a share of the leakage, 0 to 1")
-    return float(removed)

@@ -6,7 +6,7 @@ from astropy import units as u
 from astropy.table import QTable
 
 from instrument import Analyzer, InputError, Signal21cm, StokesCube, ixr, mueller
-from instrument.analyze.cells import Frame
+from instrument.analyze.cells import Cells, Frame
 from instrument.analyze.cylinders import Cylindrical
 from instrument.analyze.window import eor_window
 from instrument.errors import InstrumentWarning, UnitError
@@ -115,10 +115,10 @@ def made(ratio, par_edges=(0.05, 0.1, 0.2, 0.4, 0.8, 1.6), noise=None, **setting
     frame = Frame("K", "I", 150e6, 8.47, 9276.0, 1.72e-5, None, None, None, 0.0, 0, False)
     power = ratio * FLAT.power(np.hypot(k_perp[:, None], k_par))
     count = np.full(power.shape, 10)
-    spectrum = Plain(k_perp, k_par, power, power / 3, count, perp, par, frame, {}, None)
+    spectrum = Plain(k_perp, k_par, power, power / 3, count, perp, par, frame, {}, Cells.__new__(Cells))
     other = None
     if noise is not None:
-        other = Plain(k_perp, k_par, noise * power / ratio, power, count, perp, par, frame, {}, None)
+        other = Plain(k_perp, k_par, noise * power / ratio, power, count, perp, par, frame, {}, Cells.__new__(Cells))
     return eor_window(spectrum, FLAT, noise=other, **settings)
 
 
@@ -211,7 +211,7 @@ def test_a_cube_that_is_not_in_kelvin_is_refused():
         Analyzer(StokesCube(cube.data, FREQ, PIXEL, "Jy/beam")).eor_window(FLAT)
     with pytest.raises(InputError, match="eor_window needs a cube"):
         Analyzer().eor_window(FLAT)
-    with pytest.raises(InputError, match=r"removed = 1.2 must be a share"):
+    with pytest.raises(InputError, match=r"removed = 1.2 must be a finite number of at least 0 and of at most 1"):
         made(RATIO).mask(1.2)
 
 

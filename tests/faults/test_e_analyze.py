@@ -188,3 +188,26 @@ def test_options_that_nothing_uses_are_named(run):
     assert "not used: depths, wedge" in error and record["unused"] == {"analyze": ["depths", "wedge"]}
     record, *_ = run(cube(), "--products", "faraday")
     assert record["unused"] == {}
+
+
+def test_e13_a_common_beam_is_that_of_the_widest_channel(run):
+    """Beams of 9 to 12 arcmin: 1 Jy in 1 Jy/beam stays that, and the spectra are in K of the widest beam."""
+    width = np.linspace(12, 9, 24)
+    given = cube(unit="Jy/beam", psf=Psf.gaussian(width * u.arcmin))
+    for words, wide in ((["--common-beam"], 12.0), (["--common-beam", "15 arcmin"], 15.0)):
+        record, *_, out = run(given, "--products", "spherical", *words)
+        got = QTable.read(out / "spectrum_spherical_V.ecsv")["power"]
+        wanted = Analyzer(given.at_common_beam(wide * u.arcmin).to_kelvin()).spherical("V", taper_space="hann", bins=12)
+        assert np.allclose(got.value, wanted.power, rtol=1e-3, equal_nan=True)
+    assert "--common-beam" in run(given, "--common-beam", "3 arcmin", status=2)[2]
+
+
+def test_b7_shares_of_a_window_are_shares():
+    from instrument import InputError, Signal21cm
+
+    window = Analyzer(cube()).eor_window(Signal21cm.table())
+    for wrong in (float("nan"), -0.1, 1.5, "2", True):
+        with pytest.raises(InputError, match="share = "):
+            window.reach(share=wrong)
+        with pytest.raises(InputError, match="removed = "):
+            window.area(removed=wrong)
