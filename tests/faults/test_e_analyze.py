@@ -195,7 +195,7 @@ def test_e13_a_common_beam_is_that_of_the_widest_channel(run):
     width = np.linspace(12, 9, 24)
     given = cube(unit="Jy/beam", psf=Psf.gaussian(width * u.arcmin))
     for words, wide in ((["--common-beam"], 12.0), (["--common-beam", "15 arcmin"], 15.0)):
-        record, *_, out = run(given, "--products", "spherical", *words)
+        *_, out = run(given, "--products", "spherical", *words)
         got = QTable.read(out / "spectrum_spherical_V.ecsv")["power"]
         wanted = Analyzer(given.at_common_beam(wide * u.arcmin).to_kelvin()).spherical("V", taper_space="hann", bins=12)
         assert np.allclose(got.value, wanted.power, rtol=1e-3, equal_nan=True)
