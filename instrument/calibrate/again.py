@@ -53,5 +53,8 @@ class Fits:
 
     def _put(self, to: Int, jones: Complex, step: Float, left: Left, odd: Bool) -> None:
         self.jones[to], self.step[to], self.odd[to] = jones, step, odd
-        for name in ("rest", "data", "fit"):
-            getattr(self.left, name)[to] = getattr(left, name)
+        names = ("rest", "data", "fit")
+        parts = {name: np.array(getattr(self.left, name)) for name in names}
+        for name in names:
+            parts[name][to] = getattr(left, name)
+        self.left = Left(**parts, samples=self.left.samples)

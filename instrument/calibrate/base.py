@@ -36,7 +36,7 @@ class Solution:
     `history` is the largest relative step after each iteration. `suspects` (T, F, B) are visibilities that spoilt the
     fit of an interval: `data.flagged(solution.suspects)`, and solve again; `spoilt` counts them by baseline.
     `unexplained` (t, f) is the largest of `residual`, the same without the strongest baselines, and that of a typical
-    baseline. `doubts` are sentences about all this, printed with a solution.
+    baseline, times what J^-1 magnifies it by. `doubts` are sentences about all this, printed with a solution.
     """
 
     term: JonesTable

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from instrument import mat2
 from instrument.calibrate.again import Fits
 from instrument.calibrate.fit import strange
-from instrument.calibrate.gauge import UNKNOWNS, Gauge, common
+from instrument.calibrate.gauge import UNKNOWNS, Gauge, common, free_counts
 from instrument.calibrate.graph import counted, freedom, tied
 from instrument.calibrate.lanes import Lanes
 from instrument.calibrate.suspects import suspects
@@ -59,15 +60,17 @@ class Job:
         power = m.real**2 + m.imag**2
         each = power.reshape(len(cells), -1, len(a1), 2, 2).sum(axis=1)
         used = counted(each)
-        active = used.any(axis=(2, 3)) @ _ends(a1, a2, stations) > 0
+        alive = used[..., 0, 0] | used[..., 0, 1] | used[..., 1, 0] | used[..., 1, 1]
+        active = alive @ _ends(a1, a2, stations) > 0
         held = tied(used, a1, a2, stations, s.pattern)
         inside = held[:, a1] & held[:, a2]
-        on = used.any(axis=(2, 3)) & inside
+        on, rows = alive & inside, v.shape[1] // len(a1)
         if not on.all():  # data without a model count as left over; those of other pieces of the graph do not
-            rows = v.shape[1] // len(a1)
             v = np.where(np.tile(inside, rows)[..., None, None], v, 0.0)
             m, power = (np.where(np.tile(on, rows)[..., None, None], x, 0.0) for x in (m, power))
-        samples = (power.sum(axis=(2, 3)).reshape(len(cells), -1, len(a1)) > 0).sum(axis=1)
+        samples = on.astype(int)
+        if rows > 1:
+            samples = (power.sum(axis=(2, 3)).reshape(len(cells), rows, -1) > 0).sum(axis=1)
         lanes = Lanes(v, m, a1, a2, held, s)
         jones, step, count, history = lanes.iterate(self._start(cells, held, level))
         left = lanes.left(jones, samples)
@@ -80,13 +83,12 @@ class Job:
         if hard.any():
             fit.improve(lanes, np.flatnonzero(hard), s)
         jones, poor = fit.jones, fit.left.poor(s.unexplained) | fit.odd.any(axis=1)
-        gauges = {}
+        gauges, free = {}, free_counts(lanes.form, lanes.model_power)
         outcome = []
         for k in range(len(cells)):
-            free = common(lanes.form[k], float(lanes.model_power[k]), s.pattern)
-            if free.count > self.gauge.count and held[k].any():
-                gauges[k] = free
-            ended = self._outcome(finite[k], active[k], held[k], samples[k], free.count, fit.step[k])
+            if free[k] > self.gauge.count and held[k].any():
+                gauges[k] = common(lanes.form[k], float(lanes.model_power[k]), s.pattern)
+            ended = self._outcome(finite[k], active[k], held[k], samples[k], int(free[k]), fit.step[k])
             if ended is Outcome.CONVERGED and poor[k]:
                 ended = Outcome.POOR_FIT
             if ended is Outcome.CONVERGED and self._loose(cells[k], m[k], held[k], samples[k]):
@@ -96,6 +98,9 @@ class Job:
         failed = few & [o in (Outcome.POOR_FIT, Outcome.ITERATION_LIMIT) for o in outcome]
         found = suspects(v[failed], m[failed], a1, a2, held[failed], s) if failed.any() else {}
         lost = np.flatnonzero(failed)
+        # J^-1 magnifies what is left over: by its condition number for either station
+        with np.errstate(invalid="ignore"):
+            worst = fit.left.worst * np.median(np.where(held, mat2.condition(jones), 1.0), axis=1) ** 2
         jones[[o is not Outcome.CONVERGED for o in outcome]] = np.nan
         jones[~held] = np.nan
         named = {int(lost[k]): mask for k, mask in found.items()}
@@ -104,7 +109,7 @@ class Job:
             outcome,
             fit.count,
             fit.left.share,
-            fit.left.worst,
+            worst,
             history,
             gauges,
             named,
@@ -174,11 +179,14 @@ def _scaled(v: Complex, m: Complex, w: Float, together: bool) -> tuple[Complex, 
     top = np.frexp(w.max(axis=1, initial=0.0))[1] // 2 * 2
     root = np.sqrt(np.ldexp(w, -top[:, None]))[..., None, None]
     v, m = (np.where(root > 0, x, 0.0) * root for x in (v, m))
-    sizes = [np.abs(x.view(float)).reshape(len(x), -1).max(axis=1, initial=0.0) for x in (v, m)]
+    flat = [x.view(float).reshape(len(x), -1) for x in (v, m)]
+    sizes = [np.maximum(x.max(axis=1, initial=0.0), -x.min(axis=1, initial=0.0)) for x in flat]
     # an even number: the root of the ratio is a power of two as well
     above, below = (np.clip(np.frexp(np.where(np.isfinite(x), x, 1.0))[1] // 2 * 2, -1000, 1022) for x in sizes)
     if together:
         above = below = np.maximum(above, below)
-    for x, power in ((v, above), (m, below)):
-        x *= np.ldexp(1.0, -power)[:, None, None, None]
+    far = (np.abs(above) > 40) | (np.abs(below) > 40) | (np.abs(above - below) > 6)
+    above, below = above * far, below * far
+    if far.any():
+        v, m = (x * np.ldexp(1.0, -power)[:, None, None, None] for x, power in ((v, above), (m, below)))
     return v, m, np.ldexp(1.0, (above - below) // 2)

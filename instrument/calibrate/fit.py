@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -36,28 +37,37 @@ class Left:
     def __getitem__(self, lanes: Any) -> Left:
         return Left(self.rest[lanes], self.data[lanes], self.fit[lanes], self.samples[lanes])
 
-    @property
+    @cached_property
     def share(self) -> Float:
         """Rms left over, relative to that of the data (L,)."""
         return _root(self.rest.sum(axis=1), self.data.sum(axis=1))
 
-    @property
+    @cached_property
     def usual(self) -> Float:
         """The same without the few strongest baselines (L,): interference, or two stations, may be all that fits."""
         few = min(max(1, self.data.shape[1] // 50), self.data.shape[1] - 1)
-        order = np.argpartition(self.data, -1 - few, axis=1)[:, : self.data.shape[1] - few]
-        rest, data = (np.take_along_axis(x, order, axis=1).sum(axis=1) for x in (self.rest, self.data))
-        return _root(rest, data)
+        strongest = np.argpartition(self.data, -1 - few, axis=1)[:, self.data.shape[1] - few :]
+        rest, data = self.rest.copy(), self.data.copy()
+        for x in (rest, data):  # not the difference of two sums: one may be 1e20 times the other
+            np.put_along_axis(x, strongest, 0.0, axis=1)
+        return _root(rest.sum(axis=1), data.sum(axis=1))
 
-    @property
+    @cached_property
     def typical(self) -> Float:
         """Median over the baselines of what is left over of each, relative to it (L,)."""
         use = (self.samples > 0) & (self.data > 0)
         return np.sqrt(_quantile(np.where(use, self.rest / np.where(use, self.data, 1.0), np.nan), 0.5))
 
-    @property
+    @cached_property
+    def top(self) -> float:
+        """The largest share of its power that is left of any baseline: where that is little, nothing else is asked."""
+        return float(np.max(self.rest / np.where(self.data > 0, self.data, np.inf), initial=0.0))
+
+    @cached_property
     def worst(self) -> Float:
         """The largest of the three (L,)."""
+        if self.top <= 0.01 * WORTH:
+            return self.share
         return np.fmax(np.fmax(self.share, self.usual), self.typical)
 
     @property
@@ -71,6 +81,8 @@ class Left:
 
     def few_fit(self, unexplained: float) -> Bool:
         """Whether all that fits are the few strongest baselines (L,)."""
+        if self.top <= unexplained**2:
+            return np.zeros(len(self.rest), bool)
         return (self.usual > unexplained) & (self.usual > 1.5 * self.share)
 
 
@@ -79,6 +91,8 @@ def strange(left: Left, a1: Int, a2: Int, stations: int, tolerance: float, patte
 
     `sets` of matrices a station were solved for.
     """
+    if left.top <= 0.01 * WORTH:
+        return np.zeros(left.rest.shape, bool)
     use = (left.samples > 0) & (left.data > 0)
     # what a solve to this tolerance leaves is not noise
     small = left.rest <= min(100 * tolerance, 1e-3) ** 2 * left.data
@@ -123,7 +137,7 @@ def doubts(converged: Bool, left: Float, spoilt: Mapping[str, int]) -> tuple[str
     much = converged & (left > LEAVES)
     if much.any():
         out.append(
-            f"{much.sum()} of {converged.sum()} solutions leave more than 1 % of the data of a typical baseline "
+            f"{much.sum()} of {converged.sum()} solutions leave more than 1 % of a typical baseline once corrected "
             f"({100 * np.median(np.broadcast_to(left, much.shape)[much]):.2g} %): noise, or what the model lacks"
         )
     if spoilt:

@@ -100,11 +100,20 @@ def common(form: Float, power: float, pattern: str) -> Gauge:
     return Gauge(np.einsum("kn,kij->nij", vectors[:, values <= BLIND], use), values, pattern)
 
 
+def free_counts(forms: Float, powers: Float) -> Any:
+    """How many directions (L,) models of some power leave open, of their forms (L, n, n)."""
+    values = np.linalg.eigvalsh(forms / np.where(powers > 0, powers, 1.0)[:, None, None])
+    return (values <= BLIND).sum(axis=1)
+
+
 def gauge_of(model: Complex, weight: Float, pattern: str = "full") -> Gauge:
     """The gauge of a model (T, F, B, 2, 2) with weights (T, F, B), for station matrices of a pattern."""
     w = np.where(np.isfinite(model).all(axis=(-2, -1)), weight, 0.0).reshape(-1)
     m: Complex = np.where((w > 0)[:, None, None], model.reshape(-1, 2, 2), 0.0 + 0j)
-    # near 1: the square of 1e170 Jy is infinite
-    size = max(float(np.abs(m.view(float)).max(initial=0.0)), 1e-300)
-    moment = second_moment(m / size, w / max(float(w.max(initial=0.0)), 1e-300))
+    with np.errstate(over="ignore", invalid="ignore"):
+        moment = second_moment(m, w)
+    if not (np.all(np.isfinite(moment)) and np.trace(moment).real > 1e-200):
+        # near 1: the square of 1e170 Jy is infinite
+        size, top = max(float(np.abs(m.view(float)).max(initial=0.0)), 1e-300), max(float(w.max(initial=0.0)), 1e-300)
+        moment = second_moment(m / (size + 0j), w / top)
     return common(common_form(moment, GENERATORS[pattern]), float(np.trace(moment).real), pattern)

@@ -254,3 +254,36 @@ def judged(case):
     said = "; ".join(getattr(solution, "doubts", ()))
     names = {o.name: int((solution.outcome == o).sum()) for o in Outcome if (solution.outcome == o).any()}
     return Verdict(int(solution.converged.sum()), solution.outcome.size, worst, said, names)
+
+
+def directional_rows(count):
+    """Robust, noise, cases, right, wrong and silent, not converged: one visibility times 3 to 10 000."""
+    import importlib.util
+    from pathlib import Path
+
+    from instrument.calibrate.directional import DirectionalCal
+
+    path = Path(__file__).parents[1] / "accuracy/test_directional.py"
+    spec = importlib.util.spec_from_file_location("laboratory", path)
+    lab = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(lab)
+    data, sky, _ = lab.laboratory(slots=6, stations=10, hold=6, clusters=2)
+    found = {}
+    for seed in range(count):
+        rng = np.random.default_rng([seed, 60])
+        settings = DirectionalCal(interval=60 * u.s, tolerance=1e-6, robust=5.0 if seed % 4 > 1 else None)
+        before = data.with_noise(lab.SEFD, seed=seed) if seed % 2 else data
+        wild = np.array(before.data)
+        wild[rng.integers(6), 0, rng.integers(wild.shape[2])] *= 10 ** rng.uniform(0.5, 4)
+        solution = settings.solve(before.with_data(wild), sky)
+        row = found.setdefault((settings.robust is not None, bool(seed % 2)), [0, 0, 0, 0])
+        row[0] += 1
+        if solution["80 Jy"].outcome[0, 0] is not Outcome.CONVERGED:
+            row[3] += 1
+            continue
+        wanted = settings.solve(before, sky).predicted(sky)
+        off = lab.rms(solution.predicted(sky) - wanted) / lab.rms(data)
+        row[1 if off <= WRONG else 2] += 1
+    return [
+        ("yes" if robust else "no", "yes" if noise else "no", *row) for (robust, noise), row in sorted(found.items())
+    ]
