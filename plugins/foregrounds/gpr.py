@@ -59,15 +59,22 @@ class GaussianProcess(ForegroundRemover):
             return float(2 * np.log(np.diagonal(factor[0])).sum() + np.trace(fit)), np.array(gradient)
 
         bounds = [np.log(b) for lengths in LENGTHS for b in (VARIANCES, lengths)] + [np.log(NOISE)]
-        start = np.log([v for length in START for v in (0.3, length)] + [0.1])
+        options = {"maxiter": self.iterations, "ftol": 1e-14, "gtol": 1e-7}
         with one_thread():
-            options = {"maxiter": self.iterations}
-            done = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+            # from signal and noise of a tenth and from what the weakest spectra hold: noise of 1 mK beside 1 K is a
+            # millionth, and from 0.1 the search ended at a hundredth of it, or not, by the last bit
+            weakest = float(np.clip(np.median(np.linalg.eigvalsh(found)[: max(f // 4, 1)]), NOISE[0], 0.1))
+            starts = [[v for length in START for v in (0.3, length)] + [0.1],
+                      [0.3, START[0], 0.1 * (0.3 * weakest) ** 0.5, START[1], weakest, START[2], weakest]]  # fmt: skip
+            ends = [minimize(cost, np.log(s), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+                    for s in starts]  # fmt: skip
+            done = min(ends, key=lambda end: end.fun)
             parts, _ = _kernels(done.x, apart)
             fg = parts[0] + parts[1]
             total = fg + parts[2] + (np.exp(done.x[6]) + JITTER) * np.eye(f)
             gain = np.linalg.solve(total, fg).T
-        outcome = Outcome.CONVERGED if done.success else Outcome.ITERATION_LIMIT
+        # status 2 is a line along which nothing but rounding of the likelihood is left
+        outcome = Outcome.ITERATION_LIMIT if done.status == 1 else Outcome.CONVERGED
         rms = np.sqrt(scale * np.exp(done.x[[0, 2, 4, 6]]))
         text = "rms smooth {:.3g}, mixing {:.3g}, signal {:.3g}, noise {:.3g}".format(*rms)
         none = np.zeros((0, *maps.shape[1:]), maps.dtype)
