@@ -15,6 +15,7 @@ from instrument.model import Instrument, warn_outside_band
 from instrument.not_modelled import not_modelled
 from instrument.numbers import COUNT, TOLERANCE, UV_RANGE, brief
 from instrument.observe.directions import LIGHT
+from instrument.observe.layout import Layout
 from instrument.observe.observation import Observation
 from instrument.observe.sampling import Sampling
 from instrument.plan import Item, Plan, count_of
@@ -54,6 +55,7 @@ def make_plan(
     )
     at = Sampling.build(layout, observation.times(layout), observation.freq_hz, ra, dec, observation.phase_centre)
     _must_rise(at)
+    _say_coincident(layout)
     a, b = layout.baselines
     full = Problem(at, chain, sky, a, b, observation.interval, observation.width_hz)
     scale_jy = _scale(full)
@@ -90,6 +92,16 @@ def make_plan(
         scale_jy=scale_jy,
         seconds=work.seconds / workers,
     )
+
+
+def _say_coincident(layout: Layout) -> None:
+    """Stations within 1 mm of each other are allowed and said: more likely one was listed twice."""
+    a, b = layout.baselines
+    close = np.flatnonzero(np.linalg.norm(layout.positions_m[a] - layout.positions_m[b], axis=1) < 1e-3)
+    if close.size:
+        pair = " and ".join(layout.names[k] for k in (a[close[0]], b[close[0]]))
+        more = f" (and {close.size - 1} pairs more)" if close.size > 1 else ""
+        warn(f"stations {pair} stand in the same place{more}: their baseline sees the total flux and nothing else")
 
 
 def _must_rise(at: Sampling) -> None:

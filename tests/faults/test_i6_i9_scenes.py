@@ -184,3 +184,24 @@ def test_unused_what_was_not_used_stands_in_run_json(tmp_path, monkeypatch, caps
     words = ["--no-verify", "--out", "o", "--set", "instrument.beam='none'", "--set", "correct={}"]
     assert main(["run", "s.toml", *words]) == 0
     assert json.loads((tmp_path / "o" / "run.json").read_text())["unused"] == {"scene": ["[correct]"]}
+
+
+def test_g9_stations_in_the_same_place_are_said():
+    import numpy as np
+    from astropy import units as u
+
+    import instrument as ins
+    from instrument.errors import InstrumentWarning
+
+    enu = np.array([[0, 0, 0], [50, 0, 0], [0, 0, 0.0]]) * u.m
+    layout = ins.Layout.from_enu(["a", "b", "c"], enu, 6 * u.deg, 50 * u.deg, 0 * u.m)
+    scene = ins.Scene(
+        instrument=ins.Composed(stations=layout),
+        sky=ins.PointSky.at("08h13m36.0s +48d13m03s", [1.0]),
+        observation=ins.Observation(
+            phase_centre="08h13m36.0s +48d13m03s", transit="2012-12-07", duration=10 * u.s, interval=10 * u.s,
+            frequencies=[150] * u.MHz,
+        ),
+    )  # fmt: skip
+    with pytest.warns(InstrumentWarning, match="stations a and c stand in the same place"):
+        scene.plan()
