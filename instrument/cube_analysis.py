@@ -22,6 +22,7 @@ from instrument.cube_results import CubeResults
 from instrument.errors import InputError, InstrumentWarning, unused, warn
 from instrument.foreground.base import ForegroundRemover
 from instrument.image.cube import StokesCube
+from instrument.memory import afford
 from instrument.registry import load
 from instrument.units import Count, Finite, Float, NotNegative, Positive, PositiveSeconds, Radians, Real, UvRange
 
@@ -166,7 +167,10 @@ class CubeAnalysis(Component):
             return {"faraday": f"{len(band.lambda2)} channel(s) with data and weight in Q and U"}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", InstrumentWarning)  # said when it runs
-            self.depth_axis(cube)
+            axis = self.depth_axis(cube)
+        size = len(axis) * cube.data[0, 0].size * (16 if cube.data.dtype.itemsize > 4 else 8)
+        what = f"a Faraday cube of {len(axis)} depths and {cube.data[0, 0].size} pixels"
+        afford(size * (4 if self.clean else 1), what, "give fewer depths (--depths FIRST,LAST,STEP)")
         if self.clean and len(band.lambda2) < 3:
             raise InputError("clean: RM-CLEAN goes down to a multiple of the noise, which two channels do not tell")
         return {}

@@ -17,6 +17,7 @@ from instrument.analyze.faraday_product import Product
 from instrument.analyze.fourier import Stokes
 from instrument.errors import InputError, did_you_mean, warn
 from instrument.image.cube import StokesCube
+from instrument.memory import afford
 from instrument.observe.directions import LIGHT
 from instrument.units import Complex, Float
 
@@ -80,6 +81,9 @@ def rm_synthesis(
 
     each = -(-SAMPLE * size // pixels)
     kind = np.dtype(np.complex128 if real is np.float64 else np.complex64)
+    if out is None:
+        what = f"a Faraday cube of {len(phi)} depths and {pixels} pixels"
+        afford(len(phi) * pixels * kind.itemsize, what, "give fewer depths, a part of the image, or out='f.npy'")
     every = max(1, RELEASE_BYTES // (len(phi) * size * kind.itemsize))
     with allocated((len(phi), pixels), kind, out) as (data, release):
         found = in_threads(lambda first: transform(first, data), range(0, pixels, size), progress, release, every)

@@ -219,3 +219,14 @@ def test_e12_a_division_that_is_none_is_refused():
     cube = screens(WIDE[1], 1.0, 0.01)
     with pytest.raises(InputError, match="divide_by_i = 'power' is not one of True, False, 'voxel'"):
         Analyzer(cube).rm_synthesis([0.0], divide_by_i="power")
+
+
+# Priced before it is allocated --------------------------------------------------------------------------------------
+
+
+def test_a_faraday_cube_that_is_too_large_is_refused_with_its_size(monkeypatch):
+    monkeypatch.setattr("instrument.memory.usable", lambda: 1e6)
+    with pytest.raises(
+        InputError, match=r"Faraday cube of 1001 depths and 144 pixels would take 2.31 MB .* fewer depths"
+    ):
+        Analyzer(screens(WIDE[1], 1.0, 0.01)).rm_synthesis(np.linspace(-50, 50, 1001))
