@@ -189,6 +189,7 @@ def test_unused_what_was_not_used_stands_in_run_json(tmp_path, monkeypatch, caps
 def test_g9_stations_in_the_same_place_are_said():
     import numpy as np
     from astropy import units as u
+    from astropy.coordinates import SkyCoord
 
     import instrument as ins
     from instrument.errors import InstrumentWarning
@@ -197,7 +198,7 @@ def test_g9_stations_in_the_same_place_are_said():
     layout = ins.Layout.from_enu(["a", "b", "c"], enu, 6 * u.deg, 50 * u.deg, 0 * u.m)
     scene = ins.Scene(
         instrument=ins.Composed(stations=layout),
-        sky=ins.PointSky.at("08h13m36.0s +48d13m03s", [1.0]),
+        sky=ins.PointSky.at(SkyCoord("08h13m36.0s +48d13m03s"), [1.0]),
         observation=ins.Observation(
             phase_centre="08h13m36.0s +48d13m03s", transit="2012-12-07", duration=10 * u.s, interval=10 * u.s,
             frequencies=[150] * u.MHz,
