@@ -255,7 +255,7 @@ def test_array_factors_are_1_at_the_pointing_and_have_positive_phase_towards_the
 
 def test_in_images_east_is_left_and_north_is_up():
     night = NIGHT.with_fields(duration=6 * u.hour, interval=20 * u.min)
-    layout = Layout.from_enu("abcd", [[0, 0, 0], [400, 90, 0], [-150, 310, 0], [80, -260, 0]] * u.m, *SITE)
+    layout = Layout.from_enu(list("abcd"), [[0, 0, 0], [400, 90, 0], [-150, 310, 0], [80, -260, 0]] * u.m, *SITE)
     vis = observe(at((2, 1), (1.0, 0.5, -0.25, 0.125)), layout, night=night)
     cube = Imager(pixels=64, pixel=6 * u.arcmin).image(vis)
     y, x = np.unravel_index(cube.data[0, 0].argmax(), (64, 64))
