@@ -81,7 +81,9 @@ class RunFolder:
             raise InputError(
                 f"--out {self._out}: it is a mount point, which cannot be moved to; name a folder inside it"
             )
-        return folder if Path(self._out).is_absolute() or folder.is_symlink() else Path(os.path.relpath(folder))
+        if Path(self._out).is_absolute() or folder.is_symlink() or folder == Path.cwd():
+            return folder  # nothing can be moved onto "."
+        return Path(os.path.relpath(folder))
 
     @contextlib.contextmanager
     def _one_line(self):  # type: ignore[no-untyped-def]

@@ -46,7 +46,7 @@ class GMCA(ForegroundRemover):
         # principal maps lose nothing of span(A) within them, and there are 8 times fewer of them than channels
         values, vectors = principal(maps, min(max(20, 5 * n), f))
         basis = np.eye(f) if self.paper else vectors * _scale(values)
-        data, sample = self._coefficients(apply(basis.T, maps), seen(maps))
+        data, sample = self._coefficients(apply(basis.T, maps), seen(maps), float(values[-1]))
         noise = np.ones(f) if self.paper else _scale(values)
         found = search(data, sample, noise, n, self.iterations, self.threshold, self.paper)
         if found.mixing is None:
@@ -61,7 +61,7 @@ class GMCA(ForegroundRemover):
         separation = _all_of_it(separation, values, vectors, float(np.finfo(maps.dtype).eps))
         return separation if self.mode == "project" else self._significant(maps, separation)
 
-    def _coefficients(self, maps: Any, good: Bool) -> tuple[Any, Any]:
+    def _coefficients(self, maps: Any, good: Bool, weakest: float) -> tuple[Any, Any]:
         """Wavelet coefficients (rows, N) where there are data, and some of them: those of every n-th diagonal.
 
         The smooth plane is one of the scales: a foreground without small scales is nowhere else. The diagonals are
@@ -71,18 +71,18 @@ class GMCA(ForegroundRemover):
         planes = details if self.paper else np.concatenate([details, last[:, None]], axis=1)
         del details
         if not self.paper:
-            planes /= self._levels(planes[-1, :-1], last[-1], good)[:, None, None].astype(maps.dtype)
+            planes /= self._levels(planes[-1, :-1], last[-1], good, weakest)[:, None, None].astype(maps.dtype)
         rows, columns = (np.minimum(np.arange(k), np.arange(k)[::-1]) for k in good.shape)
         every = min(max(int(good.sum()) * planes.shape[1] // SAMPLE, 1), 1 + rows.max() + columns.max())
         some = good & ((rows[:, None] + columns) % every == 0)
         sample = planes[:, :, some if some.any() else good].reshape(len(planes), -1)
         return (planes if good.all() else planes[:, :, good]).reshape(len(planes), -1), sample
 
-    def _levels(self, details: Any, last: Any, good: Bool) -> Float:
-        """Noise of each scale and of the smooth plane (scales + 1,), from the planes of one map."""
+    def _levels(self, details: Any, last: Any, good: Bool, power: float) -> Float:
+        """Noise of each scale and of the smooth plane (scales + 1,), from the planes or the power of the weakest map."""
         white = np.array([*GAINS[: self.scales], SMOOTH[self.scales - 1]])
         if self.noise == "white":
-            return white
+            return white * (np.sqrt(power) if power > 0 else 1.0)
         found = np.array([np.median(np.abs(plane[good])) for plane in (*details, last)], float) / MAD
         return found if (found > 0).all() else white * max(found.max(), 1e-30)
 
@@ -95,9 +95,7 @@ class GMCA(ForegroundRemover):
         a, s = separation.mixing, separation.components
         values, vectors = principal(maps, min(max(20, 5 * self.components), len(maps)))
         details, last = starlet(apply(vectors[:, -1:].T, maps), self.scales)
-        levels = self._levels(details[0], last[0], good := seen(maps))
-        if self.noise == "white":
-            levels = levels * np.sqrt(max(values[-1], 0.0))
+        levels = self._levels(details[0], last[0], good := seen(maps), float(values[-1]))
         axes = leading(a @ covariance(s) @ a.T, a.shape[1])[1]
         limit = (self.threshold * levels / (1 - SLOPE)).astype(maps.dtype)  # what is below the threshold stays whole
         details, last = starlet(apply(axes.T, maps), self.scales)

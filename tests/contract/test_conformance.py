@@ -509,7 +509,7 @@ class TouchesOthers(FineRemover):
 class AddsForeground(FineRemover):
     def separate(self, maps, freq_hz):
         found = super().separate(maps, freq_hz)
-        return replace(found, mixing=-found.mixing, operator=-found.operator)
+        return replace(found, mixing=-found.mixing, operator=-found.operator, basis=None)
 
 
 class FillsHoles(FineRemover):
