@@ -79,7 +79,7 @@ class GMCA(ForegroundRemover):
         return (planes if good.all() else planes[:, :, good]).reshape(len(planes), -1), sample
 
     def _levels(self, details: Any, last: Any, good: Bool, power: float) -> Float:
-        """Noise of each scale and of the smooth plane (scales + 1,), from the planes or the power of the weakest map."""
+        """Noise of each scale and of the smooth plane (scales + 1,), of the planes or the power of one map."""
         white = np.array([*GAINS[: self.scales], SMOOTH[self.scales - 1]])
         if self.noise == "white":
             return white * (np.sqrt(power) if power > 0 else 1.0)
