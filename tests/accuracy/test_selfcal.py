@@ -22,7 +22,8 @@ def model(sky=None, stations=(), slots=16, frequencies=(150,), seconds=10):
         phase_centre=CENTRE, transit="2012-12-07", duration=slots * seconds * u.s, interval=seconds * u.s,
         frequencies=frequencies * u.MHz, channel_width=0.19 * u.MHz,
     )  # fmt: skip
-    array = instrument.load("telescopes", "lofar-hba", beam=None, stations=list(stations))
+    chosen = {"stations": list(stations)} if len(stations) else {}
+    array = instrument.load("telescopes", "lofar-hba", beam=None, **chosen)
     return Scene(instrument=array, sky=sky, observation=observation).plan().run()
 
 
