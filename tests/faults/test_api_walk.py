@@ -29,6 +29,7 @@ NOT_WALKED = {"Component", "InputError", "InstrumentError", "InstrumentWarning",
 NOT_WALKED |= {"Direction", "ScalarTerm", "Predictor"}
 # (what, argument, poison): why it is accepted
 MEANT: dict[tuple[str, str, str], str] = {
+    ("Analyzer.rm_synthesis", "divide_by_i", "True"): "by the way that suits the signal",
     ("ixr.leakage_of_ixr", "ixr_db", "inf"): "a perfect instrument leaks nothing",
     ("EoRWindow.removal_needed", "k_par", "inf"): "wherever the window is known",
     ("Signal21cm.inside", "k", "inf"): "no k of the table: False",
