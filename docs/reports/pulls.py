@@ -225,32 +225,23 @@ def main() -> None:
     asked.add_argument("--draws", type=int, default=1000)
     asked.add_argument("--areas", default=",".join(AREAS))
     given = asked.parse_args()
-    lines = [
-        "# Pulls of printed errors",
-        "",
-        f"{datetime.now(UTC):%Y-%m-%d}, instrument {__version__}, numpy {np.__version__}, "
-        f"Python {platform.python_version()}; {given.draws} draws. Made by [pulls.py](pulls.py), which says what a "
-        "pull is. Asked for: 0.9 to 1.1.",
-    ]
+    path = Path(__file__).with_suffix(".md")
+    before = path.read_text(encoding="utf-8").split("\n## ")[1:] if path.is_file() else []
+    parts = {text.partition("\n")[0].lower(): text.strip() for text in before}
     for name in given.areas.split(","):
         begin = time.perf_counter()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", InstrumentWarning)
             rows = AREAS[name](given.draws, 0)
-        spent = time.perf_counter() - begin
-        text = AREAS[name].__doc__.splitlines()[0]
-        lines += [
-            "",
-            f"## {name.capitalize()}",
-            "",
-            f"{text} ({spent:.0f} s)",
-            "",
-            "| case | what | pull |",
-            "|---|---|---|",
-        ]
-        lines += [f"| {case} | {what} | {pull:.3f} |" for case, what, pull in rows]
-    Path(__file__).with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    print("\n".join(lines))
+        said = f"{AREAS[name].__doc__.splitlines()[0]} {given.draws} draws, {time.perf_counter() - begin:.0f} s; "
+        said += f"{datetime.now(UTC):%Y-%m-%d}, instrument {__version__}, numpy {np.__version__}, "
+        lines = [name.capitalize(), "", f"{said}Python {platform.python_version()}.", ""]
+        lines += ["| case | what | pull |", "|---|---|---|"]
+        parts[name] = "\n".join(lines + [f"| {case} | {what} | {pull:.3f} |" for case, what, pull in rows])
+        print(f"## {parts[name]}", flush=True)
+    text = "Made by [pulls.py](pulls.py), which says what a pull is. Asked for: 0.9 to 1.1."
+    sections = [f"## {parts[name]}" for name in AREAS if name in parts]
+    path.write_text("\n\n".join(["# Pulls of printed errors", text, *sections]) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
