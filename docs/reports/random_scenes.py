@@ -131,6 +131,7 @@ def _composed(rng, kind, latitude):
     count = int(rng.integers(2, 7))
     enu = rng.normal(size=(count, 3)) * 10 ** rng.uniform(0, 6.9) / 3
     enu -= enu[0]  # the site is the first station: a tangent plane far from its site stands on no ground
+    enu[:, 2] = np.clip(enu[:, 2], -1e5, 1e6)  # nor does a station inside the Earth
     if rng.random() < 0.2:
         enu[1] = enu[0]
     names, place = [f"s{k}" for k in range(count)], {"latitude": latitude * u.deg, "height": 0 * u.m}
