@@ -40,7 +40,7 @@ def cube_of(freq=SHORT, unit="K", dtype=float, **planes):
     data = np.zeros((shape[0], 4, *shape[1:]), dtype)
     for name, plane in planes.items():
         data[:, "IQUV".index(name)] = plane
-    return StokesCube(data, freq * u.Hz, 0.5 * u.arcmin, unit)
+    return StokesCube(data, freq * u.Hz, 0.5 * u.arcmin, unit, constants="data")  # screens of one value are meant
 
 
 def polarized(p, freq=SHORT, dtype=float, **planes):
