@@ -20,7 +20,13 @@ def ran(tmp_path, name, *settings):
 
 def test_3c196_measures_its_brightest_sources(tmp_path):
     status, folder, record = ran(
-        tmp_path, "3c196", "sky.brightest=60", "observation.interval='5 min'", "analyze.every=1", "image.pixels=128"
+        tmp_path,
+        "3c196",
+        "sky.brightest=60",
+        "observation.duration='8 h'",
+        "observation.interval='5 min'",
+        "analyze.every=1",
+        "image.pixels=128",
     )
     assert status == 0
     table = QTable.read(folder / "leakage.ecsv")
@@ -36,7 +42,9 @@ def test_3c196_measures_its_brightest_sources(tmp_path):
 
 
 def test_di_errors_solves_what_was_put_in(tmp_path):
-    status, folder, record = ran(tmp_path, "di-errors", "observation.interval='10 min'", "image.pixels=64")
+    status, folder, record = ran(
+        tmp_path, "di-errors", "observation.duration='8 h'", "observation.interval='10 min'", "image.pixels=64"
+    )
     assert status == 0
     table = QTable.read(folder / "di_errors.ecsv")
     rows = {str(r["quantity"]): r for r in table}
