@@ -67,9 +67,9 @@ class Reading:
         if self.psf is not None:
             if self.beam is not None:
                 raise InputError(f"--beam {self.beam} and --psf {self.psf}: give one of them")
-            cube = _with_psf(cube, read_psf(self.psf, cube))
+            cube = cube.with_psf(read_psf(self.psf, cube))
         elif self.beam is not None:
-            cube = _with_psf(cube, _beam(self.beam, cube))
+            cube = cube.with_psf(_beam(self.beam, cube))
         weights = None if self.weights is None else read_numbers(self.weights, "weights of the channels")
         if weights is not None and (len(weights) != count or (weights < 0).any()):
             raise InputError(
@@ -99,7 +99,7 @@ class Reading:
             found, _ = replace(alike, stokes=None, unit=None, frequencies=None).cube([self.noise])
         except InputError:
             found, _ = alike.cube([self.noise])
-        return _with_psf(found, cube.psf) if found.psf is None and len(found.freq_hz) == len(cube.freq_hz) else found
+        return found.with_psf(cube.psf) if found.psf is None and len(found.freq_hz) == len(cube.freq_hz) else found
 
 
 def analyze_files(
@@ -160,12 +160,6 @@ def _beam(text: str, cube: StokesCube) -> Psf:
     if not 0 < min(psf.major_rad[0], psf.minor_rad[0]) <= max(psf.major_rad[0], psf.minor_rad[0]) < np.pi:
         raise InputError(f"--beam {text}: widths must be above 0 and finite, such as '3 arcmin'")
     return psf
-
-
-def _with_psf(cube: StokesCube, psf: Psf | None) -> StokesCube:
-    from astropy import units as u
-
-    return StokesCube(cube.data, cube.freq_hz * u.Hz, cube.pixel_rad * u.rad, cube.unit, cube.centre, psf)
 
 
 def _write(result: CubeResults, paths: Sequence[str], command: str, folder: Path, ledger: dict[str, list[str]]) -> None:
