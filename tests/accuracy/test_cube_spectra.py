@@ -200,6 +200,7 @@ def test_a_taper_keeps_the_level_of_white_noise():
         assert np.all(abs(level - 1) < 0.015), level
 
 
+@pytest.mark.long
 def test_sigma_is_the_scatter_of_white_noise():
     """200 cubes: the scatter has an error of 5 % in each bin, so 20 %."""
     rng = np.random.default_rng(2)

@@ -68,6 +68,7 @@ def low_and_high(cube, of):
     return found / before
 
 
+@pytest.mark.long
 def test_four_components_take_the_quiet_leakage_down_a_hundred_times_and_touch_nothing_above():
     ratio = low_and_high(split("gmca", "quiet").residual, case("quiet")[0])
     assert ratio[0] < 1 / 100

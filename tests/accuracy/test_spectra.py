@@ -142,6 +142,7 @@ def test_periodic_fields_are_recovered_within_the_sampling_error(shape, slope):
         np.testing.assert_allclose(given, sigma, rtol=1e-12)
 
 
+@pytest.mark.long
 def test_sigma_is_the_scatter_of_white_noise_for_real_complex_and_tapered_images():
     """400 images: the scatter has an error of 3.5 % in each bin, so 14 %."""
     rng = np.random.default_rng(2)

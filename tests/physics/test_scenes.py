@@ -83,6 +83,7 @@ def test_many_directions_leaves_the_noise_and_one_direction_more(tmp_path, capsy
     assert list(folder.glob("*.ecsv"))
 
 
+@pytest.mark.long
 def test_faraday_leakage_goes_all_the_way_to_the_window(tmp_path):
     """A sky without I: what is seen in I has leaked, 0.28 % of P within a factor 2 (the paper: 0.2 to 0.3 %)."""
     status, folder, record = ran(

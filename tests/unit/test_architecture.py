@@ -71,6 +71,12 @@ def module_name(path):
     return ".".join(parts[:-1] if parts[-1:] == ("__init__",) else parts)
 
 
+@cache
+def tree(path):
+    """A file, parsed once for all tests."""
+    return ast.parse(path.read_text())
+
+
 MODULES = {module_name(path) for path in FRAMEWORK}
 
 
@@ -99,7 +105,7 @@ def imports_of(path):
                     found.append(Import(module_name(path), inner, inside, child.lineno))
             visit(child, inside)
 
-    visit(ast.parse(path.read_text()), False)
+    visit(tree(path), False)
     return found
 
 
@@ -172,7 +178,7 @@ def test_the_checks_of_imports_can_fail():
 def test_the_framework_never_mentions_the_package_of_the_plugins():
     mentions = []
     for path in FRAMEWORK:
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(tree(path)):
             names = []
             if isinstance(node, ast.Import):
                 names = [alias.name for alias in node.names]
@@ -313,7 +319,7 @@ def test_no_file_is_longer_than_350_lines():
 
 
 def test_every_module_says_what_it_is_in_one_sentence():
-    missing = [where(path) for path in SOURCES if not (ast.get_docstring(ast.parse(path.read_text())) or "").strip()]
+    missing = [where(path) for path in SOURCES if not (ast.get_docstring(tree(path)) or "").strip()]
     assert missing == []
 
 
@@ -333,7 +339,7 @@ def is_overload(node):
 
 
 def test_every_public_class_and_function_has_a_docstring():
-    missing = [f"{where(path)}: {name}" for path in SOURCES for name in undocumented(ast.parse(path.read_text()))]
+    missing = [f"{where(path)}: {name}" for path in SOURCES for name in undocumented(tree(path))]
     assert missing == []
 
 
@@ -341,7 +347,7 @@ def test_nothing_swallows_every_exception():
     bare = [
         f"{where(path)}:{node.lineno}"
         for path in [*SOURCES, *(ROOT / "tests").rglob("*.py")]
-        for node in ast.walk(ast.parse(path.read_text()))
+        for node in ast.walk(tree(path))
         if isinstance(node, ast.ExceptHandler) and node.type is None
     ]
     assert bare == []
@@ -351,7 +357,7 @@ def test_a_broad_except_says_why():
     silent = [
         f"{where(path)}:{node.lineno}"
         for path in SOURCES
-        for node in ast.walk(ast.parse(path.read_text()))
+        for node in ast.walk(tree(path))
         if isinstance(node, ast.ExceptHandler)
         and isinstance(node.type, ast.Name)
         and node.type.id in ("Exception", "BaseException")

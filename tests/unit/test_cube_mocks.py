@@ -171,6 +171,7 @@ def test_leakage_of_files_without_i_is_leakage_and_a_channel_without_data_stays_
     assert np.isnan(cube.data[0, 0]).all()  # the input is as it was
 
 
+@pytest.mark.long
 def test_the_fine_screens_leak_7_mk_with_the_eigenvalues_they_are_known_by():
     """The simulation that foreground removers are tried on: 27 screens, 161 channels, 480 pixels, seed 196."""
     found = leaked(polarized_screens(screens=FINE)).data[:, 0].reshape(161, -1)
