@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from instrument.analyze.analyzer import Analyzer
 from instrument.calibrate.base import Solution
-from instrument.calibrate.di_errors import DIComparison, compare
+from instrument.calibrate.di_errors import DIComparison, DISums
 from instrument.calibrate.selfcal import SelfCal
 from instrument.errors import Outcome
 from instrument.files.solutions import write_h5parm
@@ -32,9 +32,13 @@ class CalibrationStage:
     instrument: Instrument
     images: dict[str, Images]
     parts: list[Solution] = field(default_factory=list)
-    truths: list[Any] = field(default_factory=list)
-    first: Visibilities | None = None
+    errors: DISums | None = None
     power: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def _rms(self) -> float:
+        """That of the errors put in."""
+        return max((t.rms for t in (self.instrument.gain, self.instrument.feed) if t is not None), default=0.0)
 
     def corrupt(self, model: Visibilities) -> Visibilities:
         """What the receivers make of a block: their gains and feed errors on the model."""
@@ -44,11 +48,14 @@ class CalibrationStage:
         """Solve a block and correct it; intervals that failed are flagged in what comes back."""
         solution = self.solver.solve(data, model)
         corrected = data.corrected(solution.term)
-        self.parts.append(solution)
-        self.truths.append(solution.truth(Chain(*self.instrument.receivers()), data.at))
-        self.first = self.first or model
-        found = (data, corrected, data - corrected, corrected - model)
-        for name, block in zip(IMAGES, found, strict=True):
+        # all that stays of a block are solutions and sums: masks of visibilities, data and models would grow with the run
+        self.parts.append(replace(solution, suspects=np.zeros((1, 1, 1), bool)))
+        if self._rms:
+            self.errors = self.errors or DISums(data.antenna1, data.antenna2)
+            self.errors.add(solution.truth(Chain(*self.instrument.receivers()), data.at), solution)
+        made = (lambda: data, lambda: corrected, lambda: data - corrected, lambda: corrected - model)
+        for name, make in zip(IMAGES, made, strict=True):
+            block = make()
             self.power[name] = self.power.get(name, 0.0) + float((np.abs(block.data) ** 2).sum())
             if self.images:
                 self.images[name].add(block.flagged(corrected.flag))
@@ -57,11 +64,8 @@ class CalibrationStage:
 
     def finish(self) -> CalibrationResult:
         """Everything that the stage found."""
-        assert self.first is not None
         solution = Solution.joined(self.parts)
-        truth = np.concatenate(self.truths)
-        rms = max((t.rms for t in (self.instrument.gain, self.instrument.feed) if t is not None), default=0.0)
-        errors = compare(truth, solution, self.first.antenna1, self.first.antenna2, rms) if rms else None
+        errors = self.errors.finish(self._rms) if self.errors else None
         cubes = {name: images.finish() for name, images in self.images.items()}
         return CalibrationResult(solution, errors, cubes, {k: float(np.sqrt(v)) for k, v in self.power.items()})
 
