@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from instrument.predict.threads import alone, look_again
 from instrument.units import Complex
 from instrument.whole_file import whole_file
 
@@ -25,11 +26,10 @@ def in_threads(
 
     `release` is called after `every` chunks; the first error stops what has not begun.
     """
-    from threadpoolctl import threadpool_limits
-
     found = []
-    with threadpool_limits(1), ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        jobs = [pool.submit(work, first) for first in firsts]
+    look_again()
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        jobs = [pool.submit(alone, work, first) for first in firsts]
         try:
             for done, job in enumerate(jobs, 1):
                 found.append(job.result())

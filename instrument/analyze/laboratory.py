@@ -156,10 +156,8 @@ class _Job:
 
     def blocks(self) -> Iterator[tuple[float, Problem, list[Complex]]]:
         """Fraction done, coordinates of a block, and what is predicted of the shells in it, (T, F, B, 2, 2) each."""
-        from threadpoolctl import threadpool_limits
-
         times, channels, _ = self.plan.problem.shape
-        with ThreadPoolExecutor(self.plan.workers) as pool, threadpool_limits(1):
+        with ThreadPoolExecutor(self.plan.workers) as pool:
             streams = [None if p is None else (p.block_shape, p.blocks(pool)) for p in self.plans]
             for begin in range(0, times, self.slots):
                 end = min(begin + self.slots, times)

@@ -137,10 +137,8 @@ class _Job:
 
     def blocks(self) -> Iterator[tuple[float, Models]]:
         """Fraction done, and what is predicted of every cluster in a block."""
-        from threadpoolctl import threadpool_limits
-
         times, channels, _ = self.plan.problem.shape
-        with ThreadPoolExecutor(self.plan.workers) as pool, threadpool_limits(1):
+        with ThreadPoolExecutor(self.plan.workers) as pool:
             streams = [(p.block_shape, p.blocks(pool)) for p in self.plans]
             for begin in range(0, times, self.slots):
                 end = min(begin + self.slots, times)

@@ -19,6 +19,7 @@ from instrument.checked import checked
 from instrument.errors import InputError, InstrumentError, Outcome, did_you_mean
 from instrument.jones.base import JonesTerm
 from instrument.jones.table import JonesTable
+from instrument.predict.threads import alone, look_again
 from instrument.units import Bool, Complex, Count, Float, Int, Metres, Positive, PositiveSeconds, Real, to_si
 from instrument.visibilities import Visibilities
 
@@ -130,11 +131,13 @@ class DirectionalCal(Calibrator):
         cells = [(int(k), f) for k in grid.blocks for f in range(0, data.data.shape[1], self.channels)]
         scale = [_near(x) for x in (data.data[..., None], stacked[..., None], weight)]
         job = _Job(self, data, stacked, weight, grid, scale)
-        from threadpoolctl import threadpool_limits
-
-        with threadpool_limits(1), ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-            parts = list(pool.map(lambda cell: job.solve(*cell), cells))
-        return DirectionalSolution({name: job.gathered(c, parts) for c, name in enumerate(names)})
+        look_again()
+        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+            parts = list(pool.map(lambda cell: alone(job.solve, *cell), cells))
+        suspects = np.zeros(data.data.shape[:3] if any(p.suspects for p in parts) else (1, 1, 1), bool)
+        for times, span, mask in (found for p in parts for found in p.suspects):
+            suspects[times, span] |= mask
+        return DirectionalSolution({name: job.gathered(c, parts, suspects) for c, name in enumerate(names)})
 
     def _names(self, models: Models) -> list[str]:
         if not models:
@@ -269,8 +272,8 @@ class _Job:
             begin = np.where(np.isfinite(given).all(axis=(-2, -1), keepdims=True), given, begin)
         return begin
 
-    def gathered(self, cluster: int, parts: list[_Part]) -> Solution:
-        """The solution of one cluster."""
+    def gathered(self, cluster: int, parts: list[_Part], suspects: Bool) -> Solution:
+        """The solution of one cluster; `suspects` (T, F, B) are those of all, (1, 1, 1) where there are none."""
         data, settings, freqs = self.data, self.settings, self.data.at.freq_hz
         known = self.grid.known(cluster)
         firsts = np.arange(0, len(freqs), settings.channels)
@@ -291,9 +294,6 @@ class _Job:
                     jones[t, f] = part.jones[k]
         longest = max(len(p.history) for p in parts)
         history = np.stack([np.pad(p.history, (0, longest - len(p.history))) for p in parts]).max(axis=0)
-        suspects = np.zeros(data.data.shape[:3], bool)
-        for times, span, mask in (found for p in parts for found in p.suspects):
-            suspects[times, span] |= mask
         return Solution(
             term=JonesTable(
                 values=jones,

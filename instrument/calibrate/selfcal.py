@@ -17,6 +17,7 @@ from instrument.errors import InputError
 from instrument.jones.base import JonesTerm
 from instrument.jones.table import JonesTable
 from instrument.observe.intervals import intervals
+from instrument.predict.threads import alone
 from instrument.units import Bool, Count, Float, Metres, PositiveSeconds, Real
 from instrument.visibilities import Visibilities
 
@@ -52,7 +53,7 @@ class SelfCal(Calibrator):
         chunks = [cells[i : i + LANES] for i in range(0, len(cells), LANES)]
         job = Job(self, data, v, m, weight, gauge_of(m, weight, self.pattern))
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-            parts = list(pool.map(job.solve, chunks))
+            parts = list(pool.map(lambda chunk: alone(job.solve, chunk), chunks))
         stations = len(data.layout)
         shape = (len(grouped), len(channels))
         jones = np.concatenate([p.jones for p in parts]).reshape(*shape, stations, 2, 2)

@@ -1,13 +1,16 @@
-"""BLAS on one thread inside the workers of a plan, and only there: the workers themselves are the threads."""
+"""BLAS on one thread inside the workers of plans and solvers, and nowhere else: the workers are the threads."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from threading import Lock
-from typing import Any
+from typing import Any, TypeVar
 
 from instrument.predict.base import Predictor, Problem
 from instrument.visibilities import Visibilities
+
+R = TypeVar("R")
 
 
 class OneThread:
@@ -59,7 +62,12 @@ def look_again() -> None:
 ONE_THREAD = OneThread()
 
 
+def alone(work: Callable[..., R], *given: Any) -> R:
+    """What `work` makes of `given`, in a worker."""
+    with ONE_THREAD:
+        return work(*given)
+
+
 def predict(engine: Predictor, problem: Problem) -> Visibilities:
     """A block, in a worker of any kind."""
-    with ONE_THREAD:
-        return engine.predict(problem)
+    return alone(engine.predict, problem)
