@@ -48,7 +48,7 @@ class CalibrationStage:
         """Solve a block and correct it; intervals that failed are flagged in what comes back."""
         solution = self.solver.solve(data, model)
         corrected = data.corrected(solution.term)
-        # all that stays of a block are solutions and sums: masks of visibilities, data and models would grow with the run
+        # solutions and sums are all that stays of a block: masks, data and models of a long run are GB
         self.parts.append(replace(solution, suspects=np.zeros((1, 1, 1), bool)))
         if self._rms:
             self.errors = self.errors or DISums(data.antenna1, data.antenna2)
