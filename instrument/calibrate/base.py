@@ -121,11 +121,13 @@ class Solution:
     def __str__(self) -> str:
         times, channels = self.outcome.shape
         good = int(self.converged.sum())
+        known = self.residual[np.isfinite(self.residual)]  # none where there was nothing to solve
+        left = f"{np.median(known):.1e}" if known.size else "unknown"
         looser = f" (more in {len(self.looser)} intervals)" if self.looser else ""
         return "; ".join(
             (
                 f"{good} of {times * channels} intervals converged, {np.median(self.iterations):.0f} iterations "
-                f"(median), residual {np.nanmedian(self.residual):.1e}",
+                f"(median), residual {left}",
                 f"{self.gauge}{looser}",
                 *self.doubts,
             )

@@ -114,7 +114,7 @@ def _looked(left: Left, rest: Float, use: Bool, a1: Int, a2: Int, stations: int,
         each = np.where(measures, rest / left.samples / free, np.nan)
         share = np.where(measures, rest / free / left.data, np.nan)
     enough = measures.sum(axis=1) >= np.maximum(3, 0.2 * use.sum(axis=1))
-    noise = np.where(enough, _quantile(each, BETTER), np.inf)[:, None] * left.samples
+    noise = np.where(enough, _quantile(each, BETTER), np.inf)[:, None] * np.maximum(left.samples, 1)
     wide = np.where(enough, _quantile(share, BETTER), np.inf)[:, None] * np.where(use, left.data, 1.0)
     off = use & (rest > FAR * noise)  # more than noise leaves
     odd = off & (rest > FAR * (noise + wide)) & (rest > WORTH * left.data)

@@ -29,7 +29,8 @@ def gains(solution: Solution, channel: int = 0) -> Figure:
     for k, receptor in enumerate("pq"):
         g = jones[:, :, k, k]
         with np.errstate(invalid="ignore", divide="ignore"):
-            amplitude = np.abs(g) / np.nanmedian(np.abs(g), axis=0) - 1
+            size = np.where(np.isfinite(g).any(axis=0), np.abs(g), 0.0)  # 0: stations that have no solution at all
+            amplitude = size / np.nanmedian(size, axis=0) - 1
             phase = np.rad2deg(np.angle(g * np.conj(g[:, :1])))
         for ax, values, what in ((grid[0, k], amplitude, "amplitude"), (grid[1, k], phase, "phase (deg)")):
             good = values[np.isfinite(values)]
