@@ -230,8 +230,8 @@ class Visibilities:
             state = state.with_beam(beam)
         return replace(self, data=data, beam_state=state)
 
-    def __sub__(self, other: Visibilities) -> Visibilities:
-        """Difference of two sets on the same coordinates; raises `BeamStateError` when their beam states differ."""
+    def check_same(self, other: Visibilities) -> None:
+        """Raise where the other set has other coordinates, or a beam state of its own (`BeamStateError`)."""
         if self.beam_state != other.beam_state:
             raise BeamStateError(f"cannot mix visibilities of {self.beam_state} and of {other.beam_state}")
         same = (
@@ -246,6 +246,10 @@ class Visibilities:
         )
         if not same:
             raise InputError("visibilities of other times, channels, stations or phase centres cannot be subtracted")
+
+    def __sub__(self, other: Visibilities) -> Visibilities:
+        """Difference of two sets on the same coordinates; raises `BeamStateError` when their beam states differ."""
+        self.check_same(other)
         return replace(self, data=self.data - other.data, flag=self.flag | other.flag)
 
     def _station_jones(self, term: JonesTerm | Chain) -> Complex:

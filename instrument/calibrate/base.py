@@ -156,7 +156,7 @@ def pair(data: Visibilities, model: Visibilities) -> tuple[Complex, Complex, Flo
     if not np.all(np.isfinite(data.weight)) or np.any(data.weight < 0):
         bad = data.weight[~(np.isfinite(data.weight) & (data.weight >= 0))]
         raise InputError(f"weight = {bad[0]} must be finite and not negative: flag what should not count")
-    replace(data, data=model.data) - model  # checks coordinates and beam states
+    data.check_same(model)
     weight = np.broadcast_to(data.effective_weight, data.data.shape[:3])
     return data.data, model.data, weight
 

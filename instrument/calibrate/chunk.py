@@ -54,8 +54,12 @@ class Job:
         a1, a2 = self.visibilities.antenna1, self.visibilities.antenna2
         stations, s = len(self.visibilities.layout), self.settings
         v, m, w = self._gathered(cells)
-        finite: Any = np.isfinite(m).all(axis=(-3, -2, -1)) if m.size else np.ones(len(cells), bool)
-        m = np.where(np.isfinite(m), m, 0.0)
+        finite: Any = np.ones(len(cells), bool)
+        with np.errstate(over="ignore", invalid="ignore"):
+            sound = m.size > 0 and bool(np.isfinite(m.sum()))  # in one pass; a sum may overflow
+        if not sound:
+            finite = np.isfinite(m).all(axis=(-3, -2, -1)) if m.size else finite
+            m = np.where(np.isfinite(m), m, 0.0)
         v, m, level = _scaled(v, m, w, s.pattern == "phase")
         power = m.real**2 + m.imag**2
         each = power.reshape(len(cells), -1, len(a1), 2, 2).sum(axis=1)
@@ -83,15 +87,17 @@ class Job:
         if hard.any():
             fit.improve(lanes, np.flatnonzero(hard), s)
         jones, poor = fit.jones, fit.left.poor(s.unexplained) | fit.odd.any(axis=1)
-        gauges, free = {}, free_counts(lanes.form, lanes.model_power)
+        gauges, free = {}, free_counts(lanes.eigen[0], lanes.model_power)
+        few_samples = 8 * samples.sum(axis=1) < UNKNOWNS[s.pattern] * held.sum(axis=1) - free
+        thin = (samples > 0).sum(axis=1) < 2 * held.sum(axis=1)
         outcome = []
         for k in range(len(cells)):
             if free[k] > self.gauge.count and held[k].any():
                 gauges[k] = common(lanes.form[k], float(lanes.model_power[k]), s.pattern)
-            ended = self._outcome(finite[k], active[k], held[k], samples[k], int(free[k]), fit.step[k])
+            ended = self._outcome(finite[k], active[k], held[k], few_samples[k], fit.step[k])
             if ended is Outcome.CONVERGED and poor[k]:
                 ended = Outcome.POOR_FIT
-            if ended is Outcome.CONVERGED and self._loose(cells[k], m[k], held[k], samples[k]):
+            if ended is Outcome.CONVERGED and thin[k] and self._loose(cells[k], m[k], held[k], samples[k]):
                 ended = Outcome.SINGULAR
             outcome.append(ended)
         few = fit.odd.any(axis=1) | fit.left.few_fit(s.unexplained)
@@ -141,20 +147,19 @@ class Job:
             begin[k] = np.where(np.isfinite(first).all(axis=(-2, -1))[:, None, None], first, np.eye(2))
         return begin / level[:, None, None, None]
 
-    def _outcome(self, finite: Any, active: Bool, held: Bool, samples: Int, free: int, step: Any) -> Outcome:
+    def _outcome(self, finite: Any, active: Bool, held: Bool, few_samples: bool, step: Any) -> Outcome:
         if not finite:
             return Outcome.NON_FINITE
         if not active.any():
             return Outcome.REFUSED
-        unknown = UNKNOWNS[self.settings.pattern] * int(held.sum()) - free
-        if not held.any() or 8 * int(samples.sum()) < unknown or not np.isfinite(step):
+        if few_samples or not held.any() or not np.isfinite(step):
             return Outcome.SINGULAR
         return Outcome.ITERATION_LIMIT if step > self.settings.tolerance else Outcome.CONVERGED
 
     def _loose(self, cell: Cell, model: Complex, held: Bool, samples: Int) -> bool:
         """Whether few baselines leave more open than a common matrix, and others are to be corrected with it."""
         vis, used = self.visibilities, samples > 0
-        if self.settings.pattern != "full" or used.sum() >= 2 * held.sum():
+        if self.settings.pattern != "full":
             return False
         flag = np.broadcast_to(vis.flag, vis.data.shape[:3])[cell] | ~np.isfinite(vis.data[cell]).all(axis=(-2, -1))
         wanted = ~flag.all(axis=(0, 1)) & held[vis.antenna1] & held[vis.antenna2]
@@ -178,7 +183,8 @@ def _scaled(v: Complex, m: Complex, w: Float, together: bool) -> tuple[Complex, 
     """
     top = np.frexp(w.max(axis=1, initial=0.0))[1] // 2 * 2
     root = np.sqrt(np.ldexp(w, -top[:, None]))[..., None, None]
-    v, m = (np.where(root > 0, x, 0.0) * root for x in (v, m))
+    if not np.all(root == 1):
+        v, m = (np.where(root > 0, x, 0.0) * root for x in (v, m))
     flat = [x.view(float).reshape(len(x), -1) for x in (v, m)]
     sizes = [np.maximum(x.max(axis=1, initial=0.0), -x.min(axis=1, initial=0.0)) for x in flat]
     # an even number: the root of the ratio is a power of two as well

@@ -19,7 +19,7 @@ from instrument.checked import checked
 from instrument.errors import InputError, InstrumentError, Outcome, did_you_mean
 from instrument.jones.base import JonesTerm
 from instrument.jones.table import JonesTable
-from instrument.predict.threads import alone, look_again
+from instrument.predict.threads import ONE_THREAD, look_again
 from instrument.units import Bool, Complex, Count, Float, Int, Metres, Positive, PositiveSeconds, Real, to_si
 from instrument.visibilities import Visibilities
 
@@ -132,8 +132,8 @@ class DirectionalCal(Calibrator):
         scale = [_near(x) for x in (data.data[..., None], stacked[..., None], weight)]
         job = _Job(self, data, stacked, weight, grid, scale)
         look_again()
-        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-            parts = list(pool.map(lambda cell: alone(job.solve, *cell), cells))
+        with ONE_THREAD, ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+            parts = list(pool.map(lambda cell: job.solve(*cell), cells))
         suspects = np.zeros(data.data.shape[:3] if any(p.suspects for p in parts) else (1, 1, 1), bool)
         for times, span, mask in (found for p in parts for found in p.suspects):
             suspects[times, span] |= mask

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -79,18 +80,23 @@ class Gauge:
         return x
 
 
-def second_moment(model: Complex, weight: Float) -> Complex:
-    """Sum w m m^H (..., 4, 4) of model matrices (..., N, 2, 2) read row-wise, with weights (..., N)."""
+def second_moment(model: Complex, weight: Float | None = None) -> Complex:
+    """Sum w m m^H (..., 4, 4) of model matrices (..., N, 2, 2) read row-wise, with weights (..., N), 1 by default."""
     m = model.reshape(*model.shape[:-2], 4)
-    return np.swapaxes(m * weight[..., None], -1, -2) @ m.conj()
+    return np.swapaxes(m if weight is None else m * weight[..., None], -1, -2) @ m.conj()
 
 
-def common_form(moment: Complex, generators: Complex) -> Float:
-    """Re sum w tr(T_i^H T_j), T = G M + M G^H: what a common change of all stations does to the model, (..., n, n)."""
+@cache
+def _products(pattern: str) -> Complex:
+    """T_i^H T_j of the generators of a pattern, T of M read row-wise, (n, n, 4, 4)."""
     eye = np.eye(2)
-    maps = np.stack([np.kron(g, eye) + np.kron(eye, g.conj()) for g in generators])  # of M read row-wise
-    products = np.einsum("iba,jbc->ijac", maps.conj(), maps)
-    return np.asarray(np.einsum("ijac,...ca->...ij", products, moment).real)
+    maps = np.stack([np.kron(g, eye) + np.kron(eye, g.conj()) for g in GENERATORS[pattern]])
+    return np.asarray(np.einsum("iba,jbc->ijac", maps.conj(), maps))
+
+
+def common_form(moment: Complex, pattern: str) -> Float:
+    """Re sum w tr(T_i^H T_j), T = G M + M G^H: what a common change of all stations does to the model, (..., n, n)."""
+    return np.asarray(np.einsum("ijac,...ca->...ij", _products(pattern), moment).real)
 
 
 def common(form: Float, power: float, pattern: str) -> Gauge:
@@ -100,20 +106,24 @@ def common(form: Float, power: float, pattern: str) -> Gauge:
     return Gauge(np.einsum("kn,kij->nij", vectors[:, values <= BLIND], use), values, pattern)
 
 
-def free_counts(forms: Float, powers: Float) -> Any:
-    """How many directions (L,) models of some power leave open, of their forms (L, n, n)."""
-    values = np.linalg.eigvalsh(forms / np.where(powers > 0, powers, 1.0)[:, None, None])
-    return (values <= BLIND).sum(axis=1)
+def free_counts(values: Float, powers: Float) -> Any:
+    """How many directions (L,) models of some power leave open, of the eigenvalues (L, n) of their forms."""
+    return (values <= BLIND * np.where(powers > 0, powers, 1.0)[:, None]).sum(axis=1)
 
 
 def gauge_of(model: Complex, weight: Float, pattern: str = "full") -> Gauge:
     """The gauge of a model (T, F, B, 2, 2) with weights (T, F, B), for station matrices of a pattern."""
-    w = np.where(np.isfinite(model).all(axis=(-2, -1)), weight, 0.0).reshape(-1)
-    m: Complex = np.where((w > 0)[:, None, None], model.reshape(-1, 2, 2), 0.0 + 0j)
     with np.errstate(over="ignore", invalid="ignore"):
-        moment = second_moment(m, w)
-    if not (np.all(np.isfinite(moment)) and np.trace(moment).real > 1e-200):
-        # near 1: the square of 1e170 Jy is infinite
-        size, top = max(float(np.abs(m.view(float)).max(initial=0.0)), 1e-300), max(float(w.max(initial=0.0)), 1e-300)
-        moment = second_moment(m / (size + 0j), w / top)
-    return common(common_form(moment, GENERATORS[pattern]), float(np.trace(moment).real), pattern)
+        moment = second_moment(model.reshape(-1, 2, 2)) if np.all(weight == 1) else np.full((4, 4), np.nan + 0j)
+        if not _sound(moment):  # weights, a model that is not finite everywhere, or of 1e170 Jy
+            w = np.where(np.isfinite(model).all(axis=(-2, -1)), weight, 0.0).reshape(-1)
+            m: Complex = np.where((w > 0)[:, None, None], model.reshape(-1, 2, 2), 0.0 + 0j)
+            moment = second_moment(m, w)
+            if not _sound(moment):  # near 1: the square of 1e170 Jy is infinite
+                size, top = (max(float(np.abs(x).max(initial=0.0)), 1e-300) for x in (m.view(float), w))
+                moment = second_moment(m / (size + 0j), w / top)
+    return common(common_form(moment, pattern), float(np.trace(moment).real), pattern)
+
+
+def _sound(moment: Complex) -> bool:
+    return bool(np.all(np.isfinite(moment)) and np.trace(moment).real > 1e-200)

@@ -28,6 +28,8 @@ def tied(used: Bool, a1: Int, a2: Int, stations: int, pattern: str) -> Bool:
 
     Of several pieces the one with most stations counts, if it holds more than half of the stations that have data.
     """
+    if len(used) > 1 and np.all(used == used[:1]):  # as a rule
+        return np.repeat(tied(used[:1], a1, a2, stations, pattern), len(used), axis=0)
     apart = pattern in ("diagonal", "phase")  # each receptor is a node: correlations pq and qp tie the two together
     nodes = 2 if apart else 1
     links = np.zeros((len(used), stations, nodes, stations, nodes), bool)
@@ -90,5 +92,5 @@ def freedom(model: Complex, weight: Float, a1: Int, a2: Int, stations: int) -> t
     seen = np.flatnonzero(np.einsum("aiai->a", normal) > 0)
     size = 8 * len(seen)
     values = np.linalg.eigvalsh(normal[seen][:, :, seen].reshape(size, size))
-    common = np.linalg.eigvalsh(common_form(moment.sum(axis=0) / max(len(moment), 1), generators))
+    common = np.linalg.eigvalsh(common_form(moment.sum(axis=0) / max(len(moment), 1), "full"))
     return int((values <= BLIND).sum()), int((common <= BLIND).sum())

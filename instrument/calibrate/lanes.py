@@ -39,13 +39,11 @@ class Lanes:
         self.lanes = LANES if self.count > LANES // 2 else max(1, self.count)
         self.v, self.m = planar(v, self.lanes), planar(m, self.lanes)
         self.products = (v, m)
-        moment = second_moment(m, np.ones(m.shape[:2]))
-        self.form, self.model_power = (
-            common_form(moment, GENERATORS[settings.pattern]),
-            np.einsum("lii->l", moment).real,
-        )
-        self.total = (np.abs(v) ** 2).sum(axis=(-3, -2, -1))
-        power = (np.abs(m) ** 2).sum(axis=(-2, -1)).reshape(self.count, -1, len(a1)).sum(axis=1)
+        moment = second_moment(m)
+        self.form, self.model_power = common_form(moment, settings.pattern), np.einsum("lii->l", moment).real
+        self.eigen = np.linalg.eigh(self.form)
+        self.total = power_of(v).sum(axis=1)
+        power = power_of(m).reshape(self.count, -1, len(a1)).sum(axis=1)
         stations = active.shape[1]
         self.power = np.zeros((self.count, stations, stations))
         self.power[:, a1, a2] = power
@@ -149,7 +147,7 @@ class Lanes:
         """Step G (L, 2, 2) of J_a (1 + G), the same for all stations: a few parameters that sweeps find slowly."""
         generators = GENERATORS[self.settings.pattern]
         gradient = np.einsum("nij,laki,lakj->ln", generators.conj(), old.conj(), left_over).real
-        values, vectors = np.linalg.eigh(self.form)
+        values, vectors = self.eigen
         # what the model does not see is the gauge: it stays where it is
         seen = values > 1e-9 * np.maximum(values[:, -1:], 1e-300)
         scale = np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0) / np.maximum(gain, 1e-300)[:, None]
@@ -212,6 +210,12 @@ class Lanes:
         residual(self.v, self.m, self.a1, self.a2, planar(jones, self.lanes), out)
         rest, data, fit = np.moveaxis(out[..., : self.count], 2, 1)
         return Left(rest, data, fit, samples)
+
+
+def power_of(values: Complex) -> Float:
+    """Sum of |x|^2 of matrices (..., 2, 2), (...); without the roots of `abs`."""
+    flat = np.ascontiguousarray(values).view(float).reshape(*values.shape[:-2], 8)
+    return np.asarray(np.einsum("...i,...i->...", flat, flat))
 
 
 def levels(v: Complex, m: Complex, a1: Int, a2: Int, stations: int, robust: bool = False) -> Float:

@@ -17,7 +17,7 @@ from instrument.errors import InputError
 from instrument.jones.base import JonesTerm
 from instrument.jones.table import JonesTable
 from instrument.observe.intervals import intervals
-from instrument.predict.threads import alone
+from instrument.predict.threads import ONE_THREAD
 from instrument.units import Bool, Count, Float, Metres, PositiveSeconds, Real
 from instrument.visibilities import Visibilities
 
@@ -52,8 +52,8 @@ class SelfCal(Calibrator):
         cells = [(t, f) for t in grouped.slices for f in channels]
         chunks = [cells[i : i + LANES] for i in range(0, len(cells), LANES)]
         job = Job(self, data, v, m, weight, gauge_of(m, weight, self.pattern))
-        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-            parts = list(pool.map(lambda chunk: alone(job.solve, chunk), chunks))
+        with ONE_THREAD, ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+            parts = list(pool.map(job.solve, chunks))
         stations = len(data.layout)
         shape = (len(grouped), len(channels))
         jones = np.concatenate([p.jones for p in parts]).reshape(*shape, stations, 2, 2)
