@@ -99,7 +99,7 @@ class Lanes:
 
     def _change(self, old: Complex, new: Complex) -> Float:
         """Largest relative change of any station in each lane."""
-        size = np.sqrt((np.abs(new) ** 2).sum(axis=(-2, -1)))
+        size = np.sqrt(power_of(new))
         return _relative(new - old, size, 1e-12 * size.max(axis=1, keepdims=True))
 
     def _cost(self, jones: Complex, right: Float, left: Float) -> Float:
@@ -121,7 +121,7 @@ class Lanes:
         as it is. Damping is added to the 1. Then the share of each station in
         the weight, (L, A), and what the data show of a change of the model, (L,).
         """
-        size = (np.abs(jones) ** 2).sum(axis=(-2, -1))
+        size = power_of(jones)
         weight = self.power * size[:, :, None] * size[:, None, :]
         total = weight.sum(axis=2)
         root = np.sqrt(np.where(total > 0, total, 1.0))
@@ -158,7 +158,7 @@ class Lanes:
         self, old: Complex, new: Complex, left_over: Complex, coupling: tuple[Float, Float, Float, Float], far: Float
     ) -> tuple[Complex, Float, Any]:
         """The next matrices, the largest relative change of any station in each lane, and where it was a full step."""
-        size = np.sqrt((np.abs(new) ** 2).sum(axis=(-2, -1)))
+        size = np.sqrt(power_of(new))
         floor = 1e-12 * size.max(axis=1, keepdims=True)
         close = _relative(new - old, size, floor) < far
         near = close[:, None, None, None]
@@ -223,7 +223,7 @@ def levels(v: Complex, m: Complex, a1: Int, a2: Int, stations: int, robust: bool
 
     `robust`: by least absolute values, which an outlier does not move.
     """
-    power = [(np.abs(z) ** 2).sum(axis=(-2, -1)).reshape(len(z), -1, len(a1)).sum(axis=1) for z in (v, m)]
+    power = [power_of(z).reshape(len(z), -1, len(a1)).sum(axis=1) for z in (v, m)]
     good = (power[0] > 0) & (power[1] > 0)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(good, 0.5 * np.log(power[0] / power[1]), 0.0)
@@ -252,7 +252,7 @@ class Memory:
     def mixed(self, old: Complex, new: Complex, use: Any) -> Complex:
         """The next point (L, A, 2, 2) after a step old -> new; lanes not in `use` take the step and forget the past."""
         lanes = len(old)
-        size = np.sqrt((np.abs(new) ** 2).sum(axis=(-2, -1)))
+        size = np.sqrt(power_of(new))
         share = np.repeat(1 / np.maximum(size, 1e-9 * size.max(axis=1, keepdims=True) + 1e-300), 8, axis=1)
         x, f = (np.ascontiguousarray(z).view(float).reshape(lanes, -1) for z in (old, new - old))
         self.points, self.steps = [*self.points[-DEPTH:], x], [*self.steps[-DEPTH:], f]
@@ -275,7 +275,7 @@ class Memory:
 
 
 def _relative(change: Complex, size: Float, floor: Float) -> Float:
-    moved = np.sqrt((np.abs(change) ** 2).sum(axis=(-2, -1)))
+    moved = np.sqrt(power_of(change))
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(size > floor, moved / np.maximum(size, 1e-300), 0.0).max(axis=1)
 
@@ -283,7 +283,7 @@ def _relative(change: Complex, size: Float, floor: Float) -> Float:
 def _right_ratio(old: Complex, new: Complex) -> tuple[Complex, Any]:
     """old^-1 new, the identity where old is (nearly) singular, and where it is not."""
     det = old[..., 0, 0] * old[..., 1, 1] - old[..., 0, 1] * old[..., 1, 0]
-    size = (np.abs(old) ** 2).sum(axis=(-2, -1))
+    size = power_of(old)
     good = np.abs(det) > 1e-3 * size
     inverse = (
         np.stack([np.stack([old[..., 1, 1], -old[..., 0, 1]], -1), np.stack([-old[..., 1, 0], old[..., 0, 0]], -1)], -2)
