@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 
-from instrument.analyze.told_apart import coincide, positive_solve
+from instrument.analyze.blanks import CHUNKS, FREE, PLACES, excess, places
+from instrument.analyze.patches import gathered, groups, mixture
+from instrument.analyze.told_apart import coincide, conjugate_gradients, positive_solve
 from instrument.component import Component
 from instrument.errors import InputError, Outcome
 from instrument.jones import mueller
@@ -26,7 +28,6 @@ from instrument.visibilities import Visibilities
 MOST_DIRECT = 6000  # sources up to which the PSF matrix (300 MB) is formed; above, conjugate gradients
 ROWS = 512  # of that matrix at a time
 PRODUCTS = 2.5e10  # of a PSF matrix that is made for errors alone: 1 s
-CANCELS = 1e-6  # |sum I| over sum |I| of a patch below which its parts cancel
 ROUNDING = 4 * float(np.finfo(float).eps)  # of sum w |V|^2, below which nothing is known of what a solution leaves
 
 
@@ -36,10 +37,12 @@ class SourceFluxes:
 
     The sources of a patch keep the shares of its Stokes I that they have in the sky, channel by channel.
     `error_jy` is the rms of what the solution leaves in the real or imaginary part of the visibilities times the root
-    of the diagonal of (A^H W A)^-1: right for noise, for sources that are close together or resolved too. The change of
-    apparent fluxes with time and baseline, which a constant flux cannot follow, counts as noise here; it is not
-    independent, and true errors of simulated fields are 0.7 to 2 times as large in the median. It is never below what
-    rounding hides: 3e-8 of the rms visibility.
+    of the diagonal of (A^H W A)^-1: right for noise, for sources that are close together or resolved too. What sources
+    outside the sky leave, and the change of apparent fluxes with time and baseline, is not independent: what it adds
+    up to at 32 blank places beside the sources (1 to 10 / median baseline from them) scales the error, for each Stokes
+    parameter by itself, where sums over 16 chunks of time scatter by more than noise. It is known to 1 / 8 there, and
+    holds for the mean of the sources, not for each: one beside a bright one that is not in the sky errs by more. It is
+    never below what rounding hides: 3e-8 of the rms visibility.
     """
 
     names: tuple[str, ...]
@@ -87,6 +90,7 @@ class _Slot:
     mix: Float  # (S,), share of each source in its group: that of the channel
     antenna1: Int
     antenna2: Int
+    beside: Float = field(default_factory=lambda: np.zeros((PLACES, 4)))  # adjoint sums towards blank places
 
     @property
     def uvw(self) -> Float:
@@ -104,13 +108,22 @@ class _Channel:
     power: Float = field(default_factory=lambda: np.zeros(4))  # sum of w |V|^2
     count: int = 0
 
-    def error(self, flux: Float, spread: Float) -> Float:
+    @property
+    def chunk(self) -> Int:
+        """The chunk of time that each slot is in."""
+        return np.arange(len(self.slots)) * min(CHUNKS, len(self.slots)) // len(self.slots)
+
+    def error(self, flux: Float, spread: Float, scores: Float, free: Float) -> Float:
         """Errors of the fluxes (G, 4), from |V - A f|^2 = |V|^2 - f . A^H V at the solution and diag (A^H W A)^-1 (G,).
 
-        Of 2 n real data as many degrees of freedom are gone as there are groups.
+        Of 2 n real data as many degrees of freedom are gone as there are groups. `scores` (C, M, 4) at blank places
+        and the share `free` (M,) of their weight that no source takes tell what the residuals are beyond noise.
         """
-        left = np.maximum(self.power - (flux * self.right).sum(axis=0), ROUNDING * self.power)
-        return np.sqrt(np.multiply.outer(spread, left / max(2 * self.count - len(spread), 1)))
+        data = max(2 * self.count - len(spread), 1)
+        least = ROUNDING * self.power / data
+        variance = np.maximum((self.power - (flux * self.right).sum(axis=0)) / data, least)
+        found = variance * excess(scores, np.where(free > FREE, free * self.total, 0.0), variance, data)
+        return np.sqrt(np.multiply.outer(spread, np.maximum(found, least)))
 
 
 class PhotometrySums:
@@ -119,7 +132,8 @@ class PhotometrySums:
     def __init__(self, settings: ForcedPhotometry, sky: PointSky) -> None:
         self.settings = settings
         self.sky = sky
-        self.first, self.group, self.names = _groups(sky)
+        self.first, self.group, self.names = groups(sky)
+        self.shaped = np.flatnonzero(sky.gaussian)
         self.channels: dict[float, _Channel] = {}
         self.lmn: Float | None = None
         self.axes: Float | None = None
@@ -128,13 +142,16 @@ class PhotometrySums:
         """Add a block."""
         at = block.at
         if self.lmn is None:
-            self.lmn = lmn(unit_vectors(self.sky.ra_rad, self.sky.dec_rad), at.centre)
+            ra, dec, stations = self.sky.ra_rad, self.sky.dec_rad, at.layout.positions_m * (block.freq_hz[0] / LIGHT)
+            beside = places(ra[self.first], dec[self.first], stations, self.settings.uv_range)
+            self.lmn = lmn(np.concatenate([unit_vectors(ra, dec), beside]), at.centre)
             self.axes = self.sky.shape_axes(at.centre)
         weights = block.effective_weight
         whole = len(block.antenna1) == len(at.layout) * (len(at.layout) - 1) // 2
         for f, freq in enumerate(block.freq_hz):
             if float(freq) not in self.channels:
-                self.channels[float(freq)] = _Channel(np.zeros((len(self.first), 4)), self._mixture(freq))
+                mix = mixture(self.sky.stokes(np.array([freq]))[0, :, 0], self.group, len(self.first))
+                self.channels[float(freq)] = _Channel(np.zeros((len(self.first), 4)), mix)
             channel = self.channels[float(freq)]
             for t in range(-channel.seen % self.settings.every, at.shape[0], self.settings.every):
                 uvw = at.uvw_m[t] * (freq / LIGHT)
@@ -147,7 +164,9 @@ class PhotometrySums:
                 # where a weight is zero the data may be NaN
                 data = mueller.stokes(np.where(weight[:, None, None] > 0, block.data[t, f], 0.0))
                 channel.slots.append(slot)
-                channel.right += self._adjoint(slot, data * weight[:, None])
+                seen = self._adjoint_sources(slot, self._fringes(slot), data * weight[:, None])
+                channel.right += self._gathered(slot, seen)
+                slot.beside = seen[len(self.group) :]
                 channel.power += (np.abs(data) ** 2 * weight[:, None]).sum(axis=0)
                 channel.total += float(weight.sum())
                 channel.count += int(np.count_nonzero(weight))
@@ -160,56 +179,46 @@ class PhotometrySums:
         length = np.hypot(*(uvw[block.antenna1] - uvw[block.antenna2])[:, :2].T)
         return ((length >= low) & (length <= high)).astype(float)
 
-    def _mixture(self, freq: float) -> Float:
-        """Share of each source in its group, (S,): of the sum of I, of that of |I| where it cancels, or equal parts."""
-        flux = self.sky.stokes(np.array([freq]))[0, :, 0]
-        size = np.bincount(self.group, np.abs(flux), len(self.first))
-        total = np.bincount(self.group, flux, len(self.first))
-        signed = (np.abs(total) > CANCELS * size)[self.group]
-        part = np.where((size > 0)[self.group], np.where(signed, flux, np.abs(flux)), 1.0)
-        return part / np.bincount(self.group, part, len(self.first))[self.group]
-
-    def _fringes(self, slot: _Slot) -> Complex:
+    def _fringes(self, slot: _Slot, count: int | None = None) -> Complex:
+        """Of the stations towards the sources and the blank places, or the first `count` of them, (A, S + M)."""
         assert self.lmn is not None
-        return station_phases(slot.uvw_lambda[None], self.lmn)[0]
+        return station_phases(slot.uvw_lambda[None], self.lmn[:count])[0]
 
-    def _adjoint(self, slot: _Slot, values: Complex) -> Float:
-        """Re A^H v of weighted values (B, 4): sums towards each group, (G, 4)."""
-        out = self._adjoint_sources(slot, self._fringes(slot), values)
-        return _gathered(out * slot.mix[:, None], self.group, len(self.first))
+    def _gathered(self, slot: _Slot | _Channel, sums: Float) -> Float:
+        """Sums (S, n) towards sources, and more rows, as sums (G, n) towards groups."""
+        return gathered(sums[: len(self.group)] * slot.mix[:, None], self.group, len(self.first))
 
     def _adjoint_sources(self, slot: _Slot, z: Complex, values: Complex) -> Float:
-        """The same towards each source, (S, n) of values (B, n)."""
+        """Re A^H v of weighted values (B, n) towards each column of the fringes, (S, n) or (S + M, n)."""
         out = np.zeros((z.shape[1], values.shape[1]))
         grid = np.zeros((len(z), len(z)), complex)
         for k in range(values.shape[1]):
             if values[:, k].any():
                 grid[slot.antenna1, slot.antenna2] = values[:, k]
                 out[:, k] = np.einsum("as,as->s", z.conj(), grid @ z).real
-        shaped = np.flatnonzero(self.sky.gaussian)
-        if len(shaped):
-            out[shaped] = (self._pattern(slot, z).conj().T @ values).real
+        if len(self.shaped):
+            out[self.shaped] = (self._pattern(slot, z).conj().T @ values).real
         return out
 
     def _pattern(self, slot: _Slot, z: Complex) -> Complex:
         """Visibilities of 1 Jy in each source with a shape, (B, n)."""
-        shaped = np.flatnonzero(self.sky.gaussian)
         assert self.axes is not None
-        along = np.einsum("bc,skc->kbs", slot.uvw, self.axes[shaped])
+        along = np.einsum("bc,skc->kbs", slot.uvw, self.axes[self.shaped])
         envelope = np.exp(-2 * np.pi**2 * (along[0] ** 2 + along[1] ** 2))
-        return z[slot.antenna1][:, shaped] * z[slot.antenna2][:, shaped].conj() * envelope
+        z = z[:, self.shaped]
+        return z[slot.antenna1] * z[slot.antenna2].conj() * envelope
 
     def _forward(self, slot: _Slot, flux: Float) -> Complex:
         """A f: visibilities (B, 4) of fluxes of groups (G, 4)."""
-        z = self._fringes(slot)
+        z = self._fringes(slot, len(self.group))
         each = flux[self.group] * slot.mix[:, None]
         points = np.where(self.sky.gaussian[:, None], 0.0, each)
         out = np.zeros((len(slot.antenna1), 4), complex)
         for k in range(4):
             if points[:, k].any():
                 out[:, k] = ((z * points[:, k]) @ z.conj().T)[slot.antenna1, slot.antenna2]
-        if self.sky.gaussian.any():
-            out += self._pattern(slot, z) @ each[self.sky.gaussian]
+        if len(self.shaped):
+            out += self._pattern(slot, z) @ each[self.shaped]
         return out
 
     def finish(self) -> SourceFluxes:
@@ -218,24 +227,22 @@ class PhotometrySums:
             raise InputError("no visibilities were given to measure fluxes in")
         freqs = np.array(sorted(self.channels))
         channels = [self.channels[float(freq)] for freq in freqs]
-        fluxes, spreads, outcomes, counts = zip(*(self._solve(channel) for channel in channels), strict=True)
+        fluxes, errors, outcomes, counts = zip(*(self._solve(channel) for channel in channels), strict=True)
         return SourceFluxes(
             names=self.names,
             ra_rad=self.sky.ra_rad[self.first],
             dec_rad=self.sky.dec_rad[self.first],
-            model_jy=np.stack([_gathered(s, self.group, len(self.first)) for s in self.sky.stokes(freqs)]),
+            model_jy=np.stack([gathered(s, self.group, len(self.first)) for s in self.sky.stokes(freqs)]),
             stokes_jy=np.stack(fluxes),
-            error_jy=np.stack(
-                [c.error(flux, spread) for c, flux, spread in zip(channels, fluxes, spreads, strict=True)]
-            ),
+            error_jy=np.stack(errors),
             freq_hz=freqs,
             outcome=outcomes,
             iterations=max(counts),
         )
 
     def _solve(self, channel: _Channel) -> tuple[Float, Float, Outcome, int]:
-        """Fluxes (G, 4), diag (A^H W A)^-1 (G,), how it ended, iterations."""
-        nothing = np.full((len(self.first), 4), np.nan), np.full(len(self.first), np.nan)
+        """Fluxes and their errors (G, 4), how it ended, iterations."""
+        nothing = np.full((2, len(self.first), 4), np.nan)
         if channel.total <= 0:
             return *nothing, Outcome.REFUSED, 0
         if not np.isfinite(channel.right).all():
@@ -246,103 +253,98 @@ class PhotometrySums:
             # conjugate gradients share a flux between groups that cannot be told apart, and converge
             if self._coincide(channel):
                 return *nothing, Outcome.SINGULAR, 0
-            flux, outcome, count = self._conjugate_gradients(channel)
-            return flux, np.full(len(flux), 1 / channel.total), outcome, count
+            spread, free = np.full(len(self.first), 1 / channel.total), 1 - len(self.first) / (2 * channel.count)
+            return self._iterated(channel, spread, np.full(PLACES, free))
         plain = all(slot.plain for slot in channel.slots)
-        found = positive_solve(self._psf_matrix(channel) if plain else self._sampled(channel), channel.right)
+        matrix, towards = self._psf_matrix(channel) if plain else self._sampled(channel)
+        taken = self._gathered(channel, towards.sum(axis=0)) if plain else towards[0]
+        found = positive_solve(matrix, np.concatenate([channel.right, taken], axis=1))
         if found is None:
             return *nothing, Outcome.SINGULAR, 0
-        flux, spread = found
-        if plain:
-            return flux, spread, Outcome.CONVERGED, 0
-        flux, outcome, count = self._conjugate_gradients(channel)
-        return flux, spread, outcome, count
+        both, spread = found
+        free = 1 - (taken * both[:, 4:]).sum(axis=0) / channel.total
+        if not plain:
+            return self._iterated(channel, spread, free)
+        flux, scores = both[:, :4], np.zeros((len(towards), PLACES, 4))
+        np.add.at(scores, channel.chunk, np.stack([slot.beside for slot in channel.slots]))
+        scores -= towards.transpose(0, 2, 1) @ (flux[self.group] * channel.mix[:, None])
+        return flux, channel.error(flux, spread, scores, free), Outcome.CONVERGED, 0
 
-    def _sampled(self, channel: _Channel) -> Float:
-        """PSF between all groups (G, G) of any weights, from some of the integrations: all within 1e11 products."""
-        groups, shaped = len(self.first), self.sky.gaussian
+    def _iterated(self, channel: _Channel, spread: Float, free: Float) -> tuple[Float, Float, Outcome, int]:
+        """The same by conjugate gradients, given diag (A^H W A)^-1 (G,) and the free share of blank places (M,)."""
+        start, accuracy, most = channel.right / channel.total, self.settings.accuracy, self.settings.iterations
+        flux, outcome, count = conjugate_gradients(
+            lambda flux: self._normal(channel, flux), channel.right, start, accuracy, most
+        )
+        scores = np.zeros((channel.chunk[-1] + 1, PLACES, 4))
+        for chunk, slot in zip(channel.chunk, channel.slots, strict=True):
+            model = self._forward(slot, flux) * slot.weight[:, None]
+            scores[chunk] += slot.beside - self._adjoint_sources(slot, self._fringes(slot), model)[len(self.group) :]
+        return flux, channel.error(flux, spread, scores, free), outcome, count
+
+    def _sampled(self, channel: _Channel) -> tuple[Float, Float]:
+        """As `_psf_matrix`, of any weights, from some integrations: all within 2.5e10 products; in one chunk of time.
+
+        What is summed is between groups (G, G), and between these and the blank places (1, G, M).
+        """
+        count = len(self.first)
         baselines = len(channel.slots[0].antenna1)
-        fewest = max(4, 4 * groups // baselines)  # twice as many real data as groups, or they look dependent
-        count = min(max(int(PRODUCTS / (baselines * groups**2)), fewest), len(channel.slots))
-        out, total = np.zeros((groups, groups)), 0.0
-        for i in np.linspace(0, len(channel.slots) - 1, count).round().astype(int):
+        fewest = max(4, 4 * count // baselines)  # twice as many real data as groups, or they look dependent
+        picked = min(max(int(PRODUCTS / (baselines * count**2)), fewest), len(channel.slots))
+        out, total = np.zeros((count + PLACES, count)), 0.0
+        for i in np.linspace(0, len(channel.slots) - 1, picked).round().astype(int):
             slot = channel.slots[i]
             z = self._fringes(slot)
             each = z[slot.antenna1] * z[slot.antenna2].conj()
-            if shaped.any():
-                each[:, shaped] = self._pattern(slot, z)
-            columns = _gathered((each * slot.mix).T, self.group, groups) * np.sqrt(slot.weight)
-            out += columns.real @ columns.real.T + columns.imag @ columns.imag.T
+            if len(self.shaped):
+                each[:, self.shaped] = self._pattern(slot, z)
+            sources = len(self.group)
+            columns = gathered((each[:, :sources] * slot.mix).T, self.group, count)
+            columns = np.concatenate([columns, each[:, sources:].T]) * np.sqrt(slot.weight)
+            out += columns.real @ columns[:count].real.T + columns.imag @ columns[:count].imag.T
             total += float(slot.weight.sum()) * (len(slot.antenna1) if slot.plain else 1)
-        return out * (channel.total / total)
+        out *= channel.total / total
+        return out[:count].copy(), out[count:].T[None]
 
     def _coincide(self, channel: _Channel) -> bool:
         assert self.lmn is not None and self.axes is not None
         longest = max(float((np.linalg.norm(s.uvw, axis=1) * (s.weight > 0)).max()) for s in channel.slots)
-        where = np.concatenate([self.lmn, self.axes.reshape(len(self.group), 6)], axis=1)
+        where = np.concatenate([self.lmn[: len(self.group)], self.axes.reshape(len(self.group), 6)], axis=1)
         return coincide(where, longest, self.group, channel.mix)
 
-    def _psf_matrix(self, channel: _Channel) -> Float:
-        """PSF between all groups, (G, G), for plain slots: sum_{a<b} Re x_a x_b^* = (|sum_a x_a|^2 - A) / 2."""
-        sources, groups = len(self.group), len(self.first)
+    def _psf_matrix(self, channel: _Channel) -> tuple[Float, Float]:
+        """PSF between all groups (G, G), for plain slots: sum_{a<b} Re x_a x_b^* = (|sum_a x_a|^2 - A) / 2.
+
+        And between sources and blank places in each chunk of time, (C, S, M).
+        """
+        sources, count, shaped = len(self.group), len(self.first), self.shaped
         out = np.zeros((sources, sources))
-        shaped = np.flatnonzero(self.sky.gaussian)
         columns = np.zeros((sources, len(shaped)))
-        for slot in channel.slots:
+        beside = np.zeros((int(channel.chunk[-1]) + 1, sources, PLACES))
+        wide = np.zeros((len(beside), PLACES, len(shaped)))
+        for chunk, slot in zip(channel.chunk, channel.slots, strict=True):
             z = self._fringes(slot)
             for first in range(0, sources, ROWS):
                 # the upper triangle, in rows: its other half is its mirror
-                g = z[:, first : first + ROWS].conj().T @ z[:, first:]
-                out[first : first + ROWS, first:] += (g.real**2 + g.imag**2 - len(z)) * (slot.weight[0] / 2)
+                last = min(first + ROWS, sources)
+                g = z[:, first:last].conj().T @ z[:, first:]
+                g = (g.real**2 + g.imag**2 - len(z)) * (slot.weight[0] / 2)
+                out[first:last, first:] += g[:, : sources - first]
+                beside[chunk, first:last] += g[:, sources - first :]
             if len(shaped):  # a source with a shape is not a product of stations: its own baselines, towards all others
-                towards = self._pattern(slot, z)
-                columns += self._adjoint_sources(slot, z, towards * slot.weight[0])
+                towards = self._adjoint_sources(slot, z, self._pattern(slot, z) * slot.weight[0])
+                columns += towards[:sources]
+                wide[chunk] += towards[sources:]
         upper = np.triu(out)
         out = upper + np.triu(upper, 1).T
         out[:, shaped], out[shaped] = columns, columns.T
-        mixed = _gathered(out * channel.mix[:, None], self.group, groups)
-        return _gathered((mixed * channel.mix).T.copy(), self.group, groups)
+        beside[:, shaped] = wide.transpose(0, 2, 1)
+        mixed = gathered(out * channel.mix[:, None], self.group, count)
+        return gathered((mixed * channel.mix).T.copy(), self.group, count), beside
 
     def _normal(self, channel: _Channel, flux: Float) -> Float:
         out = np.zeros_like(flux)
         for slot in channel.slots:
-            out += self._adjoint(slot, self._forward(slot, flux) * slot.weight[:, None])
+            values = self._forward(slot, flux) * slot.weight[:, None]
+            out += self._gathered(slot, self._adjoint_sources(slot, self._fringes(slot, len(self.group)), values))
         return out
-
-    def _conjugate_gradients(self, channel: _Channel) -> tuple[Float, Outcome, int]:
-        """A^H W A f = b for the four Stokes parameters at once, each with its own step."""
-        flux = channel.right / channel.total
-        residual = channel.right - self._normal(channel, flux)
-        direction, power = residual.copy(), (residual**2).sum(axis=0)
-        target = (self.settings.accuracy**2) * (channel.right**2).sum(axis=0).max()
-        for count in range(1, self.settings.iterations + 1):
-            if np.all(power <= target):
-                return flux, Outcome.CONVERGED, count
-            image = self._normal(channel, direction)
-            curve = (direction * image).sum(axis=0)
-            step = np.divide(power, curve, out=np.zeros(4), where=curve > 0)
-            flux = flux + step * direction
-            residual = residual - step * image
-            new = (residual**2).sum(axis=0)
-            direction = residual + np.divide(new, power, out=np.zeros(4), where=power > 0) * direction
-            power = new
-        return flux, Outcome.ITERATION_LIMIT, self.settings.iterations
-
-
-def _groups(sky: PointSky) -> tuple[Int, Int, tuple[str, ...]]:
-    """First source of each group, group of each source, names of the groups; a patch is a group."""
-    patches = sky.patches or ("",) * len(sky)
-    keys = [f"patch {patch}" if patch else f"source {i}" for i, patch in enumerate(patches)]
-    order = {key: k for k, key in enumerate(dict.fromkeys(keys))}
-    group = np.array([order[key] for key in keys], int)
-    first = np.unique(group, return_index=True)[1]
-    return first, group, tuple(patches[i] or sky.names[i] for i in first)
-
-
-def _gathered(values: Any, group: Int, groups: int) -> Any:
-    """Sum of rows (S, ...) over the sources of each group, (G, ...)."""
-    if groups == len(group):
-        return values
-    out = np.zeros((groups, *values.shape[1:]), values.dtype)
-    np.add.at(out, group, values)
-    return out

@@ -1,9 +1,12 @@
-"""Whether sources are told apart by an array: normal equations solved with their errors, or sources at one place."""
+"""Normal equations solved, with errors or by iteration, and whether sources are told apart by an array."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
+from instrument.errors import Outcome
 from instrument.units import Float, Int
 
 NEAR = 3e-9  # reciprocal condition of the PSF matrix below which sources are not told apart
@@ -34,6 +37,27 @@ def positive_solve(matrix: Float, right: Float) -> tuple[Float, Float] | None:
     found = cho_solve(factor, right / scale[:, None]) / scale[:, None]
     inverse, _ = lapack.dpotri(factor[0], lower=1)
     return found, inverse.diagonal() / scale**2
+
+
+def conjugate_gradients(
+    normal: Callable[[Float], Float], right: Float, flux: Float, accuracy: float, iterations: int
+) -> tuple[Float, Outcome, int]:
+    """normal(f) = right (G, 4) for the four Stokes parameters at once, each with its own step, from a first `flux`."""
+    residual = right - normal(flux)
+    direction, power = residual.copy(), (residual**2).sum(axis=0)
+    target = accuracy**2 * (right**2).sum(axis=0).max()
+    for count in range(1, iterations + 1):
+        if np.all(power <= target):
+            return flux, Outcome.CONVERGED, count
+        image = normal(direction)
+        curve = (direction * image).sum(axis=0)
+        step = np.divide(power, curve, out=np.zeros(4), where=curve > 0)
+        flux = flux + step * direction
+        residual = residual - step * image
+        new = (residual**2).sum(axis=0)
+        direction = residual + np.divide(new, power, out=np.zeros(4), where=power > 0) * direction
+        power = new
+    return flux, Outcome.ITERATION_LIMIT, iterations
 
 
 def coincide(where: Float, longest: float, group: Int, mix: Float) -> bool:
