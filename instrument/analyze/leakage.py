@@ -19,7 +19,7 @@ from instrument.units import Bool, Complex, Direction, Float, Whole, unit_vector
 from instrument.whole_file import write_ecsv
 
 NULL = 0.01  # apparent over true flux below which a source lies near a null of the beam
-CLEAR = 0.1  # % of I: error up to which a leakage counts as measured; never by its own value, which would select
+CLEAR = 0.25  # % of I: error up to which a leakage counts as measured; never by its own value, which would select
 
 
 @checked
@@ -31,7 +31,7 @@ class Leakage:
     the fluxes (see `SourceFluxes`), `error_percent` those of the leakages to first order. `near_null` marks sources
     whose apparent flux is below 1 % of the true one: their leakage is a ratio of two small numbers and says little
     about the instrument. `measured` leaves those out, those that have no Stokes I in the sky, and those too faint
-    beside their neighbours to be known to 0.1 %. Sources that the tolerance of a plan drops are not in what a run
+    beside their neighbours to be known to 0.25 %. Sources that the tolerance of a plan drops are not in what a run
     measures.
     `expected` holds the same leakages (G, 2) from the beam model (the mean Mueller matrix over baselines and times),
     where it was asked for.
