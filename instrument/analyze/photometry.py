@@ -41,7 +41,7 @@ class SourceFluxes:
     outside the sky leave, and the change of apparent fluxes with time and baseline, is not independent: what it adds
     up to at 32 blank places beside the sources (1 to 10 / median baseline from them) scales the error, for each Stokes
     parameter by itself, where sums over 16 chunks of time scatter by more than noise. It is known to 1 / 8 there, and
-    is that of the mean of the sources: true errors in the scene mock-grid are 0.6 (centre) to 1.4 times (4 to 5 deg) as
+    is that of the mean of the sources: true errors in the scene mock-grid are 0.6 (centre) to 1.2 times (4 to 5 deg) as
     large for linear leakage, 1.4 times for circular. It is never below what rounding hides, 3e-8 of the rms visibility.
     """
 

@@ -72,7 +72,7 @@ def test_measured_leakage_is_that_of_the_beam_model(table):
     """
     use = table["measured"]
     gap = np.abs(table["linear"] - table["linear_expected"])[use].value
-    # 0.4 and 2.7; of a Gaussian it would be 0.67. What changes over the night is not independent between times
+    # 0.6 and 2.7; of a Gaussian it would be 0.67. What changes over the night is not independent between times
     error = table["linear_error"][use].value
     assert np.median(gap / error) < 1
     assert (gap / error).max() < 4
