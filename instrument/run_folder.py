@@ -75,6 +75,8 @@ class RunFolder:
             return _next_free(Path("runs") / self._name)
         # a link is followed: its target is what is written
         folder = Path(os.path.realpath(Path(self._out).expanduser()))
+        if folder.is_symlink():
+            raise InputError(f"--out {self._out}: its links lead to one another; choose another")
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise InputError(f"--out {self._out}: it exists and is not an empty folder; choose another")
         if folder.is_dir() and os.path.ismount(folder):

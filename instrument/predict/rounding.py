@@ -26,7 +26,7 @@ def total_flux(problem: Problem) -> float:
     """|I| + P of all sources in the brightest channel and at the brightest time, Jy."""
     largest = 0.0
     for part in _cells(problem):
-        largest = max(largest, float(flux(part.sky, part.at).sum(axis=-1).max()))
+        largest = float(np.maximum(largest, flux(part.sky, part.at).sum(axis=-1).max()))  # max() would drop NaN
     return largest
 
 
@@ -38,7 +38,7 @@ def rounding(problem: Problem, scale_jy: float) -> float:
     for part in _cells(problem):
         jansky = flux(part.sky, part.at)
         wrong = (jansky * relative).sum(axis=-1) + gain * brightness_rounding(part.sky, part.at).sum(axis=-1)
-        largest = max(largest, float(wrong.max()))
+        largest = float(np.maximum(largest, wrong.max()))
     return largest / scale_jy
 
 

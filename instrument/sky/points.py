@@ -28,6 +28,7 @@ OPTIONAL = (
     "reference_hz", "spectral_terms", "logarithmic", "rotation_measure", "polarization_follows_i", "major_rad",
     "minor_rad", "angle_rad",
 )  # fmt: skip
+MOST_RM = 1e15  # rad/m2; 2 RM lambda^2 has lost all its digits long before
 PER_SOURCE = ("ra_rad", "dec_rad", "stokes_jy", *OPTIONAL)
 
 
@@ -81,6 +82,12 @@ class PointSky(Sky):
             raise InputError("a declination lies beyond the pole")
         if self.reference_hz is None and (self.spectral_terms is not None or self.rotation_measure is not None):
             raise InputError("spectral terms and rotation measures need reference_hz")
+        if self.rotation_measure is not None and np.any(far := np.abs(self.rotation_measure) > MOST_RM):
+            worst = int(np.argmax(far))
+            raise InputError(
+                f"rotation_measure of source '{self.names[worst]}' is {self.rotation_measure[worst]:.3g} rad/m2: "
+                f"beyond {MOST_RM:g} float64 knows no angle"
+            )
         if self.reference_hz is not None and np.any(self.reference_hz <= 0):
             raise InputError("reference_hz must be positive")
         for field in ("major_rad", "minor_rad"):

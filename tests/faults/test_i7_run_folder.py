@@ -55,6 +55,13 @@ def test_i7_a_home_is_meant_as_the_shell_means_it(here, monkeypatch):
     assert names(here) == ["home"] and (here / "home" / "x" / "run.json").is_file()
 
 
+def test_i7_links_that_lead_to_one_another_are_refused_before_the_work(here):
+    (here / "a").symlink_to("b")
+    (here / "b").symlink_to("a")
+    with pytest.raises(InputError, match="--out a: its links lead to one another; choose another"):
+        RunFolder("tiny", "a")
+
+
 @pytest.mark.parametrize("there", [True, False])
 def test_i7_a_link_is_followed(here, there):
     if there:

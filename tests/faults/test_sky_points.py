@@ -64,6 +64,12 @@ def test_a5_a_spectrum_without_a_finite_flux_is_refused():
         plan(sky, [1])
 
 
+def test_a_rotation_measure_of_which_float64_knows_no_angle_is_refused():
+    """A fuzzed 1e308 made Q and U NaN, a maximum dropped the NaN, and the plan divided by a flux of zero."""
+    with pytest.raises(InputError, match=r"rotation_measure of source '3C1' is 1e\+308 rad/m2: beyond 1e\+15"):
+        linear(rotation_measure=[1e308, 0.0])
+
+
 def test_a2_columns_that_were_not_read_stand_in_the_plan(tmp_path):
     (tmp_path / "t.csv").write_text("ra_deg,dec_deg,i_jy,log_curv\n123.4,48.2,1,5\n")
     with pytest.warns(InstrumentWarning, match="not used: log_curv"):
