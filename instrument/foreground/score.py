@@ -9,9 +9,9 @@ beyond 0.3 /Mpc, where no smooth foreground reaches; it may have any spatial spe
 (Stein 1981, Ann. Statist. 9, 1135). For a fixed operator g = P x the covariance is s tr(T^T P S T). One chosen by
 looking at x also fits the noise by its choice, so the covariance is measured: with a draw w of that noise,
 (T^T w, T^T (g(x + e w) - g(x))) / e; with g(x + e w) in r as well this is unbiased for a noise larger by e^2 = 9 %
-in power, whatever the remover does
-(coupled bootstrap of Oliveira, Lei & Tibshirani 2021, arXiv:2111.09447). What of a 21-cm signal is not white over
-channels counts as foreground.
+in power, whatever the remover does (coupled bootstrap of Oliveira, Lei & Tibshirani 2021, arXiv:2111.09447). What a
+fixed operator makes of that 9 %, e^2 s tr(T^T P S P^T T), is taken off; what it tips in the choice stays. What of a
+21-cm signal is not white over channels counts as foreground.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ NOISE_FROM = 0.3  # 1/Mpc: delays beyond it hold noise
 PROBES = 32  # spectra of those delays in which the noise of each cell is measured: to 18 %, their sum to far better
 DRAW = 0.3  # of the noise, added to see what an adapted remover makes of it: a smaller one scatters more
 UNSURE = 0.3  # of a score: a scatter beyond which a second draw is made
+QUIET = 5e-3  # of a score: a smaller scatter is in none of the digits that are printed
 LEAST = 4  # delays of noise
+SMALL = 1e-8  # of the trace, on the diagonal of the fit to a draw: fewer pixels than channels leave it singular
 RIDGE = 1e-2  # of the least squares for the noise of channels, towards their mean
 
 
@@ -39,8 +41,9 @@ RIDGE = 1e-2  # of the least squares for the noise of channels, towards their me
 class Score:
     """Power of the error of a removal over that of the foreground at low delays; `value` 1 is nothing gained.
 
-    `sigma` is the scatter of an estimate over the cells. Where the foreground is not seen above the noise `value` is a
-    lower bound (`bound`): the estimated foreground was replaced by twice its scatter. `removed` is what a perfect
+    `sigma` is the scatter of an estimate about the true score, over draws of the noise on the same foreground: next to
+    nothing without noise. Where the foreground is not seen above the noise `value` is a lower bound (`bound`): the
+    estimated foreground was replaced by twice its error. `removed` is what a perfect
     removal would take away, in the power of the data at these delays.
     """
 
@@ -72,6 +75,8 @@ class Score:
     def __str__(self) -> str:
         value = f"{'at least ' if self.bound else ''}{self.value:.2g}"
         spread = f" +- {self.sigma:.1g}" if self.sigma and not self.bound else ""
+        if spread and self.sigma < QUIET * self.value:
+            spread += " (there is hardly any noise)"
         return f"{value}{spread}: {self.verdict} (1 = nothing gained, > 1 = worse than not cleaning; {self.how})"
 
 
@@ -99,41 +104,101 @@ def estimated_score(
 ) -> Score:
     """Score from maps (C, Ny, Nx) alone; `again` runs an adapted remover once more, else `operator` (C, C) is it."""
     modes, cells = _modes(freq_hz, k_par, taper), _cells(freq_hz, pixel_rad, maps.shape[1:], k_perp)
-    noise, scale = noise_power(maps, freq_hz)
+    noise, scale, probes = _noise(maps, freq_hz)
     noise_here = noise[cells]
     level = np.trace(modes.T @ (scale[:, None] * modes))
-    before = _powers(modes, maps, cells) - noise_here * level
-    # |DFT|^2 of a real image: each cell of the half plane is independent
-    n, spread = before.size, float(np.sqrt(before.size) * before.std())
-    bound = bool(before.sum() < 2 * spread)
-    total = max(float(before.sum()), 2 * spread)
+    seen, left = _spectra(modes, maps, cells), _spectra(modes, maps - found, cells)
+    errors = _Errors(modes, scale, probes, noise_here, float(maps.any(axis=0).mean()))
+    power = float(_power(seen).sum())
+    before = power - float(noise_here.sum() * level)
+    spread = errors.of_noise(seen, np.zeros((modes.shape[1], len(scale))), 0.0)
+    bound = before < 2 * spread
+    total = max(before, 2 * spread)
     if not total > 0:
         raise InputError("the cube has no power at these delays: there is nothing to score")
 
-    def drawn(seed: int) -> Float:
+    def drawn(seed: int) -> tuple[Float, Float]:
+        assert again is not None
         draw = _draw(noise, scale, maps, seed)
-        moved = again(maps + draw.dtype.type(DRAW) * draw) - found if again else None
+        moved = again(maps + draw.dtype.type(DRAW) * draw) - found
+        response = modes.T @ operator if operator is not None else _response(modes, draw, moved)
         one, two = _spectra(modes, draw, cells), _spectra(modes, moved, cells)
         fitted = (one.real * two.real + one.imag * two.imag).sum(axis=0) / DRAW
-        return np.asarray(_powers(modes, maps - found - moved, cells) - noise_here * level + 2 * fitted)
+        more = DRAW**2 * noise_here * np.trace(response @ (scale[:, None] * response.T))
+        return _power(left - two) - _power(left) + 2 * fitted - more, response
 
-    def valued(left: Float) -> tuple[float, float]:
-        value = float(left.sum() / total)
-        return value, float(np.sqrt(n) * (left - value * before).std() / total)
+    def valued(added: Float, response: Float) -> tuple[float, float]:
+        value = float((_power(left) - noise_here * level + added).sum() / total)
+        own = errors.of_draw(added) if again else 0.0
+        sigma = np.hypot(errors.of_noise(left - value * seen, response, value), own)
+        # sigma^2 here is a square in `value`, whose own error adds spread^2 sigma^2 / total^2 to it, and 1 / total^2
+        # is on average too large by 3 spread^2 / total^2: at 4 spreads of foreground sigma were 12 % too large
+        return value, float(sigma / np.hypot(total, 2 * spread))
 
     if again is None:
         assert operator is not None
-        fitted = noise_here * np.trace(modes.T @ operator @ (scale[:, None] * modes))
+        response = modes.T @ operator
         how = "estimated; noise fitted: trace of the operator"
-        value, sigma = valued(_powers(modes, maps - found, cells) - noise_here * level + 2 * fitted)
+        value, sigma = valued(2 * noise_here * np.trace(response @ (scale[:, None] * modes)), response)
     else:
         how = f"estimated; noise fitted: from one draw, seed {seed}"
-        value, sigma = valued(left := drawn(seed))
+        added, response = drawn(seed)
+        value, sigma = valued(added, response)
         if sigma > UNSURE * abs(value):
             how = f"estimated; noise fitted: from two draws, seeds {seed} and {seed + 1}"
-            value, sigma = valued((left + drawn(seed + 1)) / 2)
-    power = float((before + noise_here * level).sum())
+            value, sigma = valued((added + drawn(seed + 1)[0]) / 2, response)
     return Score(max(value, 0.0), sigma, how, bound, total / power if power else 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Errors:
+    """Scatter of sums over cells from the noise: modes (C, m), shape (C,), probes (C, K), noise power of a cell (N,).
+
+    `seen` is the share of the pixels that are not holes: behind holes neighbouring cells are alike, and fewer count.
+    """
+
+    modes: Float
+    shape: Float
+    probes: Float
+    power: Float
+    seen: float
+
+    def of_noise(self, left: Any, response: Float, value: float) -> float:
+        """Error of an estimated sum |T^T (f - g)|^2 - value |T^T f|^2 for `left` = T^T (x - g - value x) (m, N).
+
+        `response` (m, C) is T^T P, what the foreground found has of noise. With the noise n of power s S, M = T T^T,
+        R = (1 - value) I - P and w^T the probes that measure s over their gain (K of them, W = sum of w w^T / K), the
+        error is 2 Re n^H M (x - g - value x) - (1 - value) |T^T n|^2 less its mean as s measured in n gives it:
+        2 Re n^H M R f + n^H B n, with B = M R + R^T M - (1 - value) M - tr(S [2 M R - (1 - value) M]) W,
+        of variance 2 s f^H R^T M S M R f + s^2 tr (B S)^2. The first term is found from x, where it is larger by
+        2 s^2 tr(M R S R^T M S): the second-order Stein formula (Bellec & Zhang 2021, Ann. Statist. 49, 1864) but for
+        the turning of P itself, which counts with channels and not with cells.
+        """
+        t, s = self.modes, self.shape
+        rest = (1 - value) * t.T - response
+        inner = t.T @ (s[:, None] * t)
+        probes = self.probes / np.einsum("cp,c,cp->p", self.probes, s, self.probes)
+        count = probes.shape[1]
+        form = t @ rest + rest.T @ t.T - (1 - value) * (t @ t.T)
+        form = (form - np.trace(form * s) / count * (probes @ self.probes.T)) * s
+        squares = np.trace(form @ form) - 2 * np.trace(inner @ (rest * s) @ rest.T)
+        linear = np.einsum("mn,mk,kn->n", left.conj(), inner, left, optimize=True).real
+        # a power from `count` exponential ones has a square too large by 1 / count
+        variance = 2 * (self.power * linear).sum() + (self.power**2).sum() * squares * count / (count + 1)
+        return float(np.sqrt(max(variance, 0.0) / self.seen))
+
+    def of_draw(self, added: Float) -> float:
+        """Error of the sum of what a draw adds to each cell (N,), from how it differs between them over their noise."""
+        even = added - self.power * (added.sum() / self.power.sum())
+        return float(np.sqrt((even**2).sum() / self.seen))
+
+
+def _response(modes: Float, draw: Any, moved: Any) -> Float:
+    """Modes of the foreground (m, C) that a spectrum of noise makes: the fit to how far a draw moved it, all pixels."""
+    noise = draw.reshape(len(draw), -1)
+    power = (noise @ noise.T).astype(float)
+    moment = apply(modes.T, moved).reshape(modes.shape[1], -1) @ noise.T / DRAW
+    return np.asarray(np.linalg.solve(power + SMALL * np.trace(power) * np.eye(len(power)), moment.T).T)
 
 
 def noise_power(maps: Any, freq_hz: Float) -> tuple[Float, Float]:
@@ -142,6 +207,11 @@ def noise_power(maps: Any, freq_hz: Float) -> tuple[Float, Float]:
     From delays beyond 0.3 /Mpc: the complement of what is band-limited to less (eigenvectors of sinc(2 tau (f - f'))
     above 1e-12, so channels may be uneven). Raises `InputError` where fewer than 4 are left.
     """
+    return _noise(maps, freq_hz)[:2]
+
+
+def _noise(maps: Any, freq_hz: Float) -> tuple[Float, Float, Float]:
+    """As `noise_power`, and the spectra (C, K) in which the power was measured."""
     from scipy.linalg import eigh
 
     tau = _delay(freq_hz, NOISE_FROM)
@@ -163,7 +233,7 @@ def noise_power(maps: Any, freq_hz: Float) -> tuple[Float, Float]:
     gain = np.einsum("cp,c,cp->p", probes, shape, probes)
     cells = np.ones((maps.shape[1], maps.shape[2] // 2 + 1), bool)
     power = (np.abs(_spectra(probes, maps, cells)) ** 2 / gain[:, None]).mean(axis=0)
-    return power.reshape(cells.shape), shape
+    return power.reshape(cells.shape), shape, probes
 
 
 def _delay(freq_hz: Float, k_par: float) -> float:
@@ -210,8 +280,13 @@ def _spectra(modes: Float, maps: Any, cells: Bool) -> Any:
     return np.stack([fft.r2c(image, nthreads=0)[cells] for image in found])
 
 
+def _power(spectra: Any) -> Float:
+    """Sum over modes (N,) of |spectra|^2 (m, N)."""
+    return np.asarray((np.abs(spectra) ** 2).sum(axis=0, dtype=np.float64))
+
+
 def _powers(modes: Float, maps: Any, cells: Bool) -> Float:
-    return np.asarray((np.abs(_spectra(modes, maps, cells)) ** 2).sum(axis=0, dtype=np.float64))
+    return _power(_spectra(modes, maps, cells))
 
 
 def _draw(noise: Float, shape: Float, maps: Any, seed: int) -> Any:
