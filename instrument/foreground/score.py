@@ -32,6 +32,7 @@ NOISE_FROM = 0.3  # 1/Mpc: delays beyond it hold noise
 PROBES = 32  # spectra of those delays in which the noise of each cell is measured: to 18 %, their sum to far better
 DRAW = 0.3  # of the noise, added to see what an adapted remover makes of it: a smaller one scatters more
 UNSURE = 0.3  # of a score: a scatter beyond which a second draw is made
+MOST_DRAWS = 6  # made while it is not told from 1 and the draws are what leaves it open
 OWN = 8  # stream of the draws: of its seed alone a mock of noise of the same seed would be the same noise again
 QUIET = 5e-3  # of a score: a smaller scatter is in none of the digits that are printed
 TURNS = 1.5  # a draw that scatters more in g(x + e w) than in the covariance alone: g(x) is taken for r then
@@ -132,26 +133,33 @@ def estimated_score(
         # a choice that turns a bright foreground: gmca, 1 mK, error of a score 20 times larger with it than without
         return (2 * fitted if errors.of_draw(moving) > TURNS * errors.of_draw(2 * fitted) else moving), response
 
-    def valued(added: Float, response: Float) -> tuple[float, float]:
+    def valued(added: Float, response: Float) -> tuple[float, float, float]:
         value = float((_power(left) - noise_here * level + added).sum() / total)
         own = errors.of_draw(added) if again else 0.0
         sigma = np.hypot(errors.of_noise(left - value * seen, response, value), own)
         # sigma^2 here is a square in `value`, whose own error adds spread^2 sigma^2 / total^2 to it, and 1 / total^2
         # is on average too large by 3 spread^2 / total^2: at 4 spreads of foreground sigma were 12 % too large
-        return value, float(sigma / np.hypot(total, 2 * spread))
+        scale = float(np.hypot(total, 2 * spread))
+        return value, float(sigma) / scale, own / scale
 
     if again is None:
         assert operator is not None
         response = modes.T @ operator
         how = "estimated; noise fitted: trace of the operator"
-        value, sigma = valued(2 * noise_here * np.trace(response @ (scale[:, None] * modes)), response)
+        value, sigma, _ = valued(2 * noise_here * np.trace(response @ (scale[:, None] * modes)), response)
     else:
         how = f"estimated; noise fitted: from one draw, seed {seed}"
         added, response = drawn(seed)
-        value, sigma = valued(added, response)
-        if sigma > UNSURE * abs(value):
-            how = f"estimated; noise fitted: from two draws, seeds {seed} and {seed + 1}"
-            value, sigma = valued((added + drawn(seed + 1)[0]) / 2, response)
+        value, sigma, own = valued(added, response)
+        draws = 1
+        while (
+            draws < MOST_DRAWS
+            and own > sigma / 2
+            and ((sigma > UNSURE * abs(value) and draws < 2) or abs(value - 1) < sigma)
+        ):
+            added, draws = added + drawn(seed + draws)[0], draws + 1
+            how = f"estimated; noise fitted: from {draws} draws, seeds {seed} to {seed + draws - 1}"
+            value, sigma, own = valued(added / draws, response)
     return Score(max(value, 0.0), sigma, how, bound, total / power if power else 0.0)
 
 
