@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 NEAR = 6  # cells: the square of a four-term taper reaches no further
 LEAST = 1e-4  # of the correlation of a cell with itself: what is less counts with the far ones
+SLACK = 1 + 1e-9  # a cell at the edge of a bin is in it, whatever the rounding of its k
 SAMPLE = 400  # cells of a bin whose neighbours are counted: all of a smaller bin, of a larger one to 2 %
 
 
@@ -78,7 +79,7 @@ class Modes:
 
     def cylindrical(self, cells: Cells, perp: Float, bounds: Int, rows: Int, bins_par: int) -> Float:
         """Modes (P, L) of bins of k_perp (edges, and where they begin among the cells) and of delays (their bins)."""
-        low, high = cells.k_perp[0] * (1 - 1e-9), cells.k_perp[-1] * (1 + 1e-9)
+        low, high = cells.k_perp[0] * (1 - 1e-9), cells.k_perp[-1] * SLACK**2
         parts = []
         for b in range(len(perp) - 1):
             k = bounds[b] + some(int(bounds[b + 1] - bounds[b]), b)
@@ -86,7 +87,7 @@ class Modes:
         sizes = cells.sums(bounds, np.ones(len(cells.k_perp)))
 
         def within(b: int, v: Int, u: Int, _: Int) -> Any:
-            k = np.hypot(v * self.step[0], u * self.step[1])
+            k = SLACK * np.hypot(v * self.step[0], u * self.step[1])
             return (k >= max(perp[b], low)) & (k <= high) & ((k < perp[b + 1]) | (b == len(perp) - 2))
 
         plane = independent(self.across, np.ones(1), parts, sizes, within)
@@ -104,7 +105,7 @@ class Modes:
 
     def spherical(self, cells: Cells, edges: Float, bounds: Int, slope: float, least: float) -> Float:
         """Modes (N,) of bins of k; `bounds` (M, N + 1) are where they begin among the cells of each delay."""
-        low, high = cells.k_perp[0] * (1 - 1e-9), cells.k_perp[-1] * (1 + 1e-9)
+        low, high = cells.k_perp[0] * (1 - 1e-9), cells.k_perp[-1] * SLACK**2
         parts, sizes = [], np.zeros(len(edges) - 1)
         upto = np.append(0.0, np.cumsum(cells.times))
         for b in range(len(edges) - 1):
@@ -117,9 +118,10 @@ class Modes:
 
         def within(b: int, v: Int, u: Int, delay: Int) -> Any:
             across, par = np.hypot(v * self.step[0], u * self.step[1]), np.abs(delay) * self.step[2]
-            k = np.hypot(across, par)
+            k = SLACK * np.hypot(across, par)
             fits = (across >= low) & (across <= high) & (par >= least) & (across * slope <= par * (1 + 1e-9))
-            return fits & (k > 0) & (k >= edges[b]) & ((k < edges[b + 1]) | (b == len(edges) - 2) & (k <= edges[b + 1]))
+            last = (b == len(edges) - 2) & (k <= SLACK**2 * edges[b + 1])
+            return fits & (k > 0) & (k >= edges[b]) & ((k < edges[b + 1]) | last)
 
         return independent(self.across, self.along, parts, sizes, within) / (2 if self.real else 1)
 
