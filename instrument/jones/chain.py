@@ -115,9 +115,12 @@ class Chain(Component):
         elif "frame" in kinds:
             group = at.layout.frames[1]
             where = at.one_per_frame()
+        shared = reduce(mat2.mul, (t.jones(where) for t in matrices)) if matrices else None
+        if shared is not None and shared.shape[2] == 1:
+            group = np.zeros_like(group)  # terms of each station whose values are the same for all
         return Factors(
             outer=reduce(mat2.mul, outer) if outer else None,
             scalar=reduce(np.multiply, scalars) if scalars else None,
-            shared=reduce(mat2.mul, (t.jones(where) for t in matrices)) if matrices else None,
+            shared=shared,
             group=group,
         )

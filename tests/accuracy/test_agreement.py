@@ -7,7 +7,18 @@ from instrument_plugins.elements.dipole import CrossedDipole
 from instrument_plugins.elements.dish import Airy
 
 import instrument
-from instrument import Chain, Composed, FeedTerm, GainTerm, Layout, Observation, Parallactic, PointSky, Scene
+from instrument import (
+    Chain,
+    Composed,
+    FeedTerm,
+    GainTerm,
+    Layout,
+    Observation,
+    Parallactic,
+    PointSky,
+    ScalarTerm,
+    Scene,
+)
 from instrument.observe.directions import offset
 from instrument.units import Direction
 
@@ -60,6 +71,16 @@ def own_elements_chain(stations: int, seed: int) -> Composed:
     return Composed(stations=layout, terms=Chain(CrossedDipole(height=0.5 * u.m), Parallactic()))
 
 
+class Screen(ScalarTerm):
+    """A phase that grows over the sky and from station to station, (1, 1, A, S)."""
+
+    maps = ("feed", "feed")
+
+    def scalar(self, at):
+        slope = np.arange(len(at.layout))[None, None, :, None]
+        return np.exp(30j * slope * at.lmn[:, 0])
+
+
 def instruments() -> dict:
     gain, feed = GainTerm(rms=0.1, seed=1), FeedTerm(rms=0.1, seed=2)
     lofar = {"stations": STATIONS}
@@ -73,6 +94,10 @@ def instruments() -> dict:
         "dish": Composed(
             stations=instrument.load("telescopes", "lofar-hba", **lofar).layout(),
             terms=Chain(Airy(diameter=20 * u.m), Parallactic()),
+        ),
+        "the same gain of all behind a screen": Composed(
+            stations=instrument.load("telescopes", "lofar-hba", **lofar).layout(),
+            terms=Chain(gain, Screen(), GainTerm(values=[[[[0.6 + 0.9j, 0.4 - 0.3j]]]])),
         ),
         "own axes, many": own_elements_chain(9, 3),
         "own axes, few": own_elements_chain(4, 4),
@@ -120,8 +145,7 @@ def test_factors_of_a_chain_multiply_to_its_jones_matrices(name):
     shape = (*at.shape, 2, 2)
     product = np.broadcast_to(np.eye(2, dtype=complex), shape).copy()
     if factors.shared is not None:
-        group = factors.group if factors.shared.shape[2] > 1 else np.zeros(len(factors.group), int)
-        product = np.broadcast_to(factors.shared[:, :, group], shape).copy()
+        product = np.broadcast_to(factors.shared[:, :, factors.group], shape).copy()
     if factors.scalar is not None:
         product = product * factors.scalar[..., None, None]
     if factors.outer is not None:
