@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 import numpy as np
 
 from instrument.errors import InputError, did_you_mean
-from instrument.numbers import Real, Whole, brief
+from instrument.numbers import Real, Whole, brief, unmasked
 
 T = TypeVar("T")
 Door = Callable[[Any, str], Any]  # (value, name) -> the value to use; raises InputError
@@ -216,7 +216,8 @@ def _array(dtype: Any) -> Door:
             or (given.size and given.dtype.kind not in _KINDS[kind])
         ):
             raise InputError(f"{name} = {brief(value)} must be an array of {_WORDS[kind]}")
-        return value
+        unmasked(value, name)
+        return np.asarray(given)
 
     return door
 

@@ -15,6 +15,8 @@ from pydantic_core import core_schema
 
 from instrument.errors import InputError
 
+LARGEST = 1e100  # squares of what is larger, or smaller than 1/LARGEST, leave float64
+
 
 def brief(value: object) -> str:
     """What was given, for an error: at most 60 characters, nothing that moves a cursor."""
@@ -24,6 +26,19 @@ def brief(value: object) -> str:
         text = "a number too long to write"
     text = "".join(c if c.isprintable() else "?" for c in text)
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def unmasked(value: object, name: str) -> None:
+    """Raises `InputError` where a masked array hides values: numpy would take what lies under the mask."""
+    hidden = int(np.count_nonzero(getattr(value, "mask", False)))
+    if hidden:
+        raise InputError(f"{name} has {hidden} masked values: leave them out, or fill them (.filled)")
+
+
+def squarable(size: float, what: str) -> None:
+    """Raises `InputError` where the squares of a largest size leave float64; 0 has one."""
+    if size and not 1 / LARGEST < size < LARGEST:
+        raise InputError(f"{what} reaches {size:.1e}, beyond what squares can hold: scale the cube")
 
 
 def out_of_range(

@@ -39,7 +39,7 @@ from instrument.numbers import Span as Span
 from instrument.numbers import Tolerance as Tolerance
 from instrument.numbers import UvRange as UvRange
 from instrument.numbers import Whole as Whole
-from instrument.numbers import brief, out_of_range
+from instrument.numbers import brief, out_of_range, unmasked
 
 Complex = NDArray[np.complexfloating[Any, Any]]
 Float = NDArray[np.float64]
@@ -62,6 +62,7 @@ def to_si(
     from astropy import units as u
 
     wanted = u.Unit(unit)
+    unmasked(value, name)
     if isinstance(value, str):
         try:
             value = u.Quantity(value)
@@ -76,7 +77,7 @@ def to_si(
     try:
         number = np.asarray(value.to_value(wanted))
     except u.UnitConversionError as error:
-        raise UnitError(f"{name} needs a unit convertible to {unit}, got '{value}'") from error
+        raise UnitError(f"{name} needs a unit convertible to {unit or 'no unit'}, got {brief(value)}") from error
     if number.dtype.kind not in "fiu":
         raise InputError(f"{name} = {brief(value)} is not a real number")
     number = number.astype(float)
@@ -153,6 +154,7 @@ def plain(value: Any, dtype: type, name: str, finite: bool = False, at_least: fl
     """
     if getattr(value, "unit", None) is not None:
         raise UnitError(f"{name} takes plain numbers in SI units, got values in '{value.unit}': use .to_value(...)")
+    unmasked(value, name)
     try:
         given = np.asarray(value)
         kind, wanted = given.dtype.kind, np.dtype(dtype).kind

@@ -11,6 +11,7 @@ from instrument.analyze.fourier import comoving, line_of_sight
 from instrument.checked import checked
 from instrument.compiled import compiled
 from instrument.errors import InputError
+from instrument.numbers import unmasked
 from instrument.observe.directions import LIGHT
 from instrument.phasor import cis
 from instrument.units import Float, to_si
@@ -21,6 +22,7 @@ STEPS = 100_000  # of the search for half height, each 0.125 over the width of t
 
 def number(value: Any, unit: str, name: str) -> Float:
     """Finite numbers of any shape in a unit, given bare or as a `Quantity`; raises `InputError` for others."""
+    unmasked(value, name)
     out = np.asarray(to_si(value, unit, name) if getattr(value, "unit", None) is not None else value)
     wanted = "finite numbers" + (f" in {unit}" if unit else "")
     if out.dtype.kind not in "iuf":
