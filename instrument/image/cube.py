@@ -15,7 +15,7 @@ from instrument.image.channels import channel_index, in_band
 from instrument.image.common_beam import at_common_beam
 from instrument.image.cube_file import write_cube
 from instrument.observe.directions import LIGHT
-from instrument.units import Count, Direction, Float, to_si
+from instrument.units import Count, Direction, Float, one_si, to_si
 
 BOLTZMANN = 1.380649e-23  # J/K
 JY = 1e-26  # W m^-2 Hz^-1
@@ -78,6 +78,7 @@ class StokesCube:
     `StokesCube(data=array, frequencies=freqs, pixel=0.5 * u.arcmin, unit="K")` makes one from anywhere. The centre is
     pixel (Ny // 2, Nx // 2). Channels stay in the order given; `sorted()` puts them in order of frequency. A channel
     or a rim of one value (0, -999) is no data: it becomes NaN and is said, unless `constants` is "data".
+    Masked voxels become NaN; a `Quantity` is turned into `unit`.
     """
 
     data: Float
@@ -98,19 +99,19 @@ class StokesCube:
         constants: Literal["no data", "data"] = "no data",
     ) -> None:
         put = object.__setattr__
-        cube = np.asarray(data)
-        if cube.ndim != 4 or cube.shape[1] != 4:
+        if unit not in get_args(Unit):
+            raise InputError(f"unit = {unit!r} is not one of {', '.join(map(repr, get_args(Unit)))}: say which it is")
+        cube = _images(data, unit)
+        if cube.ndim != 4 or cube.shape[1] != 4 or not cube.size:
             raise InputError(f"data has shape {cube.shape}, needed (channels, 4 Stokes, y, x)")
         freq = np.atleast_1d(np.asarray(to_si(frequencies, "Hz", "frequencies"), float))
         if len(freq) != len(cube):
             raise InputError(f"{len(cube)} channels but {len(freq)} frequencies")
         if (wrong := ~(np.isfinite(freq) & (freq > 0))).any():
             raise InputError(f"frequencies of {listing(wrong)} are {show(freq[wrong])} Hz: needed finite and above 0")
-        step = float(to_si(pixel, "rad", "pixel"))
-        if not 0 < step < np.inf:
-            raise InputError(f"pixel = {pixel} is not finite and above 0")
-        if unit not in get_args(Unit):
-            raise InputError(f"unit = {unit!r} is not one of {', '.join(map(repr, get_args(Unit)))}: say which it is")
+        step = one_si(pixel, "rad", "pixel", above=0)
+        if (span := max(cube.shape[2:]) * step) > np.pi and max(cube.shape[2:]) > 1:
+            raise InputError(f"pixel = {pixel}: the images span {np.rad2deg(span):.4g} deg, more than half the sky")
         if constants not in ("no data", "data"):
             raise InputError(f"constants = {constants!r} is not 'no data' or 'data'")
         put(self, "data", without_constants(cube) if constants == "no data" else cube)
@@ -232,6 +233,25 @@ class StokesCube:
         (FITS paper III), which programs that know it not refuse rather than misread. `read_cube` reads both back.
         """
         write_cube(self, path)
+
+
+def _images(data: Any, unit: str) -> Any:
+    """Real numbers of any shape in the unit of the cube: a `Quantity` is turned into it, masked values become NaN."""
+    given = getattr(data, "unit", None)
+    if given is not None:
+        from astropy import units as u
+
+        try:
+            data = data.to_value(u.Unit(unit))
+        except u.UnitConversionError:
+            raise InputError(f"data in '{given}' cannot be turned into the unit of the cube, '{unit}'") from None
+    images, mask = np.asarray(data), getattr(data, "mask", False)
+    if images.dtype.kind not in "fiu":
+        raise InputError(f"data holds {images.dtype}, needed real numbers")
+    if np.any(mask):
+        images = np.array(images, np.result_type(images, np.float32))
+        images[mask] = np.nan
+    return images
 
 
 def listing(wrong: Any) -> str:
