@@ -22,6 +22,7 @@ from instrument.analyze.fourier import (
 from instrument.analyze.modes import Modes
 from instrument.errors import InputError, InstrumentWarning
 from instrument.image.cube import StokesCube
+from instrument.numbers import LARGEST, squarable
 from instrument.units import Bool, Complex, Float, Int, one_si
 
 if TYPE_CHECKING:
@@ -168,6 +169,8 @@ def cells_of(
     scale = (distance * cube.pixel_rad) ** 2 * depth * (grid_hz[1] - grid_hz[0]) / (n * ny * nx * square)
     folds = _both_signs(n)
     power, auto = _delays(spectra, along, folds, scale)
+    if not 1 / LARGEST**2 < float(auto.max()) < LARGEST**2:  # only then is it worth to look at all voxels
+        squarable(max(_size(c, stokes) for c in cubes), stokes)
     frame = Frame(
         cube.unit, stokes, freq, z, distance, depth, taper, taper_space, uv_range and (low, high),
         1 - float(has.mean()), int((~here).sum()), psf_corrected,
@@ -203,6 +206,12 @@ def _plane(cube: StokesCube, stokes: str, channel: int, out: Float | Complex) ->
         out.real, out.imag = cube.data[channel, 1], cube.data[channel, 2]
     else:
         out[:] = cube.data[channel, "IQUV".index(stokes)]
+
+
+def _size(cube: StokesCube, stokes: str) -> float:
+    """Largest |value| of a Stokes parameter, or of Q and U."""
+    values = cube.data[:, 1:3] if stokes == "P" else cube.data[:, "IQUV".index(stokes)]
+    return float(np.fmax.reduce(np.abs(values), axis=None))
 
 
 def _mask(cube: StokesCube, stokes: str, order: Int, infill: bool) -> tuple[Bool, Bool, Float | Complex]:

@@ -26,6 +26,7 @@ from instrument.analyze.modes import independent, some
 from instrument.checked import checked
 from instrument.errors import InputError, InstrumentWarning
 from instrument.image.cube import StokesCube
+from instrument.numbers import squarable
 from instrument.units import Bool, Float, Int
 from instrument.whole_file import write_ecsv
 
@@ -112,6 +113,7 @@ def spectrum_2d(
     if not has.all():
         text = f"{1 - has.mean():.2g} of the pixels are NaN and count as zero: rims of holes scatter steep spectra"
         warnings.warn(text, InstrumentWarning, stacklevel=3)
+    squarable(float(np.abs(image[has]).max()), stokes)
     # no interferometer sees the mean, and a taper or a hole would spread it over the first cells
     variance, times = cell_variance(np.where(has, image - image[has].mean(), 0.0), window)
     v, u = (np.fft.fftfreq(n, cube.pixel_rad) for n in image.shape)

@@ -17,10 +17,10 @@ from instrument.errors import InputError, InstrumentWarning, Outcome
 from instrument.foreground.linear import apply
 from instrument.foreground.score import Score, estimated_score, true_score
 from instrument.image.cube import StokesCube
+from instrument.numbers import squarable
 from instrument.units import Bool, Float, Int, Seed
 
 Plane = Literal["I", "Q", "U", "V"]
-LARGEST = 1e100  # squares of what is larger, or smaller than 1/LARGEST, leave float64
 
 
 @checked
@@ -111,8 +111,7 @@ class Clean:
             warnings.warn(text, InstrumentWarning, stacklevel=4)
         use = np.flatnonzero(~(empty | flat))
         size = max((max(abs(float(low[c])), abs(float(high[c]))) for c in use), default=1.0)
-        if not 1 / LARGEST < size < LARGEST:
-            raise InputError(f"{stokes} reaches {size:.1e} {cube.unit}, beyond what squares can hold: scale the cube")
+        squarable(size, stokes)
         maps = plane if len(use) == len(plane) else plane[use]
         if not good.all():
             maps = np.where(good, maps, maps.dtype.type(0))
