@@ -17,6 +17,7 @@ from instrument.jones.chain import Chain
 from instrument.jones.gain import exact_key, slot_normals
 from instrument.jones.towards import Towards, towards_in
 from instrument.model import Instrument
+from instrument.numbers import LARGEST
 from instrument.observe.layout import Layout
 from instrument.observe.sampling import Sampling
 from instrument.units import POSITIVE, SEED, Bool, Complex, Direction, Float, Int, one_si, plain
@@ -91,6 +92,7 @@ class Visibilities:
     beam_state: BeamState = BeamState()
 
     def __post_init__(self) -> None:
+        self._as_the_kernels_take_them()
         times, channels, _, _ = self.at.shape
         want = (times, channels, len(self.antenna1), 2, 2)
         if self.data.shape != want:
@@ -102,6 +104,7 @@ class Visibilities:
             stations = getattr(self, name)
             if stations.dtype.kind not in "iu" or np.any((stations < 0) | (stations >= len(self.layout))):
                 raise InputError(f"{name} must hold numbers of stations, 0 to {len(self.layout) - 1}")
+        self._check_baselines()
         for name in ("weight", "flag"):
             shape = getattr(self, name).shape
             if len(shape) != 3 or any(n not in (1, m) for n, m in zip(shape, want, strict=False)):
@@ -110,6 +113,27 @@ class Visibilities:
             raise InputError(f"flag holds {self.flag.dtype}, needed bool")
         if self.weight.dtype.kind not in "fiu" or not np.all(np.isfinite(self.weight)) or np.any(self.weight < 0):
             raise InputError("weight must be finite and not negative: flag what does not count")
+        beyond = self.weight[(self.weight > 0) & ((self.weight < 1 / LARGEST) | (self.weight > LARGEST))]
+        if beyond.size:
+            raise InputError(f"weight = {beyond[0]:g} is beyond what squares can hold: scale all of them")
+
+    def _as_the_kernels_take_them(self) -> None:
+        """Numbers of any precision and byte order in double precision and the machine's own order."""
+        for name, kind in (("data", complex), ("weight", float), ("antenna1", int), ("antenna2", int)):
+            given = getattr(self, name)
+            if given.dtype.kind in "fiuc" and given.dtype != kind and not (kind is int and given.dtype.kind == "f"):
+                object.__setattr__(self, name, given.astype(kind))
+
+    def _check_baselines(self) -> None:
+        first, second, names = self.antenna1, self.antenna2, self.layout.names
+        if first.shape != second.shape:
+            raise InputError(f"antenna1 has {len(first)} baselines, antenna2 {len(second)}")
+        if (alone := np.flatnonzero(first == second)).size:
+            raise InputError(f"baseline {alone[0]} is of station '{names[first[alone[0]]]}' with itself: leave it out")
+        pairs, count = np.unique(np.minimum(first, second) * len(names) + np.maximum(first, second), return_counts=True)
+        if len(pairs) < len(first):
+            a, b = divmod(int(pairs[count.argmax()]), len(names))
+            raise InputError(f"baseline {names[a]}-{names[b]} is there twice: leave one out")
 
     def __repr__(self) -> str:
         times, channels, baselines = self.data.shape[:3]
@@ -156,11 +180,11 @@ class Visibilities:
 
     def with_data(self, data: Complex) -> Visibilities:
         """The same coordinates with other data, (T, F, B, 2, 2)."""
-        return replace(self, data=np.asarray(data))
+        return replace(self, data=data)
 
     def flagged(self, flag: Bool) -> Visibilities:
         """The same with more flags, (T, F, B), length 1 where constant."""
-        return replace(self, flag=self.flag | np.asarray(flag, bool))
+        return replace(self, flag=self.flag | flag)
 
     def weighted(self, weight: Float) -> Visibilities:
         """The same with other weights (T, F, B), length 1 where constant; negative and non-finite ones raise."""
