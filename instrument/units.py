@@ -77,7 +77,8 @@ def to_si(
     try:
         number = np.asarray(value.to_value(wanted))
     except u.UnitConversionError as error:
-        raise UnitError(f"{name} needs a unit convertible to {unit or 'no unit'}, got {brief(value)}") from error
+        given = brief(" ".join(str(value).split()))
+        raise UnitError(f"{name} needs a unit convertible to {unit or 'no unit'}, got {given}") from error
     if number.dtype.kind not in "fiu":
         raise InputError(f"{name} = {brief(value)} is not a real number")
     number = number.astype(float)
