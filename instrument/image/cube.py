@@ -109,7 +109,9 @@ class StokesCube:
             raise InputError(f"{len(cube)} channels but {len(freq)} frequencies")
         if (wrong := ~(np.isfinite(freq) & (freq > 0))).any():
             raise InputError(f"frequencies of {listing(wrong)} are {show(freq[wrong])} Hz: needed finite and above 0")
-        step = one_si(pixel, "rad", "pixel", above=0)
+        step = one_si(pixel, "rad", "pixel")
+        if not step > 0:
+            raise InputError(f"pixel = {pixel} is not above 0")
         if (span := max(cube.shape[2:]) * step) > np.pi and max(cube.shape[2:]) > 1:
             raise InputError(f"pixel = {pixel}: the images span {np.rad2deg(span):.4g} deg, more than half the sky")
         if constants not in ("no data", "data"):
