@@ -218,10 +218,11 @@ class Visibilities:
         return replace(self, data=noisy)
 
     def corrected(self, term: JonesTerm | Chain) -> Visibilities:
-        """J_a^-1 V J_b^-H for a direction-independent term; where a Jones matrix is singular: zero and flagged."""
+        """J_a^-1 V J_b^-H for a direction-independent term; zero and flagged where J or its square has no inverse."""
         jones = self._station_jones(term)
         inverse = mat2.inverse(jones)
-        good = np.asarray(np.isfinite(inverse).all(axis=(-2, -1)))
+        largest = np.abs(inverse).max(axis=(-2, -1))  # the data are multiplied with two of them
+        good = np.asarray((largest > 1 / LARGEST) & (largest < LARGEST))
         inverse = np.where(good[..., None, None], inverse, 0.0)
         data = mat2.sandwich(inverse[:, :, self._pick(inverse, 1)], self.data, inverse[:, :, self._pick(inverse, 2)])
         flag = self.flag | ~(good[:, :, self._pick(inverse, 1)] & good[:, :, self._pick(inverse, 2)])
