@@ -250,6 +250,11 @@ def one_line(cls: type[BaseModel], error: ValidationError) -> str:
         elif kind == "value_error":
             inside = where and not message.startswith(where) and str(item["loc"][-1]) not in message
             parts.append(f"{where}: {message}" if inside else message)
+        elif kind in ("model_type", "dict_type"):
+            keys = " = ..., ".join(_fields_at(cls, item["loc"]))
+            parts.append(f"{where} = {brief(item['input'])} must be a table{keys and f': {{ {keys} = ... }}'}")
+        elif kind in ("tuple_type", "list_type"):
+            parts.append(f"{where} = {brief(item['input'])} must be a list, in brackets")
         else:
             parts.append(f"{where} = {item['input']!r}: {message[:1].lower()}{message[1:]}")
     return "; ".join(parts)

@@ -19,7 +19,7 @@ from instrument.errors import InputError, did_you_mean, warn
 from instrument.image.cube import StokesCube
 from instrument.memory import afford
 from instrument.observe.directions import LIGHT
-from instrument.units import Complex, Float
+from instrument.units import NOT_NEGATIVE, Complex, Float
 
 Precision = Literal["single", "double"]
 Division = Literal[True, False, "voxel", "fit"]
@@ -55,7 +55,7 @@ def rm_synthesis(
     phi, band = _depths(depths, voxels)
     w, lambda2, real = voxels.w, voxels.lambda2, voxels.real
     mean = float(w @ lambda2 / w.sum())
-    centre = mean if lambda2_0 is None else one(lambda2_0, "m2", "lambda2_0")
+    centre = mean if lambda2_0 is None else NOT_NEGATIVE.check(one(lambda2_0, "m2", "lambda2_0"), "lambda2_0")
     given = _noise(noise, cube.unit, len(voxels.freq), bool(divide_by_i))
     product = Product(phi, lambda2 - centre, voxels.scaled / w.sum(), real)
     planes, pixels = (2 if stokes == "P" else 1), voxels.values[0, 0].size

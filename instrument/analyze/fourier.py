@@ -8,9 +8,9 @@ import numpy as np
 
 from instrument.errors import InputError, did_you_mean, warn
 from instrument.image.cube import StokesCube
-from instrument.numbers import Real
+from instrument.numbers import Real, Whole
 from instrument.observe.directions import LIGHT
-from instrument.units import COUNT, Complex, Float, Int, plain, to_si
+from instrument.units import Complex, Float, Int, plain, to_si
 
 HYDROGEN = 1420405751.768  # Hz, the 21-cm line at rest
 Stokes = Literal["I", "Q", "U", "V", "P"]
@@ -26,6 +26,7 @@ TAPERS = {
         0.00001388721735,
     ),
 }  # fmt: skip
+MANY = Whole(at_least=1, at_most=1_000_000)  # bins: no cube has more cells along a side
 
 
 def plane(cube: StokesCube, stokes: str, channel: int) -> Float | Complex:
@@ -128,7 +129,7 @@ def sine(wedge: Any) -> float:
 def bin_edges(low: float, high: float, bins: Any, log: bool) -> Float:
     """Edges in 1/Mpc (N + 1,): `bins` of them, equal in ln k or in k, or the edges given with their unit."""
     if getattr(bins, "unit", None) is None and np.ndim(bins) == 0:
-        edges = (np.geomspace if log else np.linspace)(low, high, COUNT.check(bins, "bins") + 1)
+        edges = (np.geomspace if log else np.linspace)(low, high, MANY.check(bins, "bins") + 1)
     else:
         edges = np.atleast_1d(to_si(bins, "1/Mpc", "bins"))
     if edges.ndim != 1 or len(edges) < 2 or not (np.diff(edges) > 0).all() or edges[0] < 0:

@@ -154,3 +154,32 @@ def test_weights_within_may_be_scaled(vis, weight, weighting):
     wanted = imager.image(vis)
     found = imager.image(vis.weighted(np.full((1, 1, 1), weight)))
     assert np.allclose(found.data, wanted.data, rtol=0, atol=1e-9)  # of 3 Jy; 5e-11 was seen, the gridder's threads
+
+
+@pytest.mark.parametrize("size", [1e200, 1e-200])
+def test_gains_that_take_data_out_of_the_numbers_are_flagged(vis, size):
+    """Data over the square of 1e200 were 0, with all their weight."""
+    found = vis.corrected(ins.GainTerm(values=np.full((1, 1, 4, 2), size, complex)))
+    assert not found.effective_weight.any() and not found.data.any()
+
+
+# Settings ------------------------------------------------------------------------------------------------------------
+
+
+def test_settings_without_meaning_are_refused():
+    """A thousand million bins ended in a MemoryError; no wavelength has a square below 0."""
+    analyzer = ins.Analyzer(cube())
+    for call in (analyzer.spectrum_2d, analyzer.cylindrical, analyzer.spherical):
+        refused(lambda call=call: call(bins=10**9), "bins", "1e+06")
+    refused(lambda: analyzer.rm_synthesis([0.0], lambda2_0=-1.0), "lambda2_0 = -1", "0")
+
+
+def test_a_table_given_as_a_list_or_text_is_refused_in_our_words(tmp_path, capsys):
+    from instrument.cli import main
+
+    scene = tmp_path / "x.toml"
+    scene.write_text('name = "x"\n[observation]\nfrequency = "150 MHz"\n[image]\nuv_range = "3,80"\n')
+    assert main(["plan", str(scene)]) == 2
+    said = capsys.readouterr().err
+    assert "frequency = '150 MHz' must be a table" in said and "centre" in said
+    assert "uv_range = '3,80' must be a list" in said
