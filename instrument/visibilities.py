@@ -22,6 +22,8 @@ from instrument.observe.layout import Layout
 from instrument.observe.sampling import Sampling
 from instrument.units import POSITIVE, SEED, Bool, Complex, Direction, Float, Int, one_si, plain
 
+CANCELS = 1e6  # of a Jones matrix: its inverse twice in double precision leaves 1e-4
+
 
 @checked
 @dataclass(frozen=True)
@@ -218,11 +220,16 @@ class Visibilities:
         return replace(self, data=noisy)
 
     def corrected(self, term: JonesTerm | Chain) -> Visibilities:
-        """J_a^-1 V J_b^-H for a direction-independent term; zero and flagged where J or its square has no inverse."""
+        """J_a^-1 V J_b^-H for a direction-independent term; zero and flagged where J or its square has no inverse.
+
+        So also where the inverse cancels to a part in 1e6 or less: data would be wrong by 1e-4 of themselves and more.
+        """
         jones = self._station_jones(term)
         inverse = mat2.inverse(jones)
         largest = np.abs(inverse).max(axis=(-2, -1))  # the data are multiplied with two of them
-        good = np.asarray((largest > 1 / LARGEST) & (largest < LARGEST))
+        # |J^-1| |J| (Skeel): rounding of the data grows with its square; 1 where receptors differ in scale alone
+        lost = mat2.mul(np.abs(inverse), np.abs(jones)).max(axis=(-2, -1)).real
+        good = np.asarray((largest > 1 / LARGEST) & (largest < LARGEST) & (lost < CANCELS))
         inverse = np.where(good[..., None, None], inverse, 0.0)
         data = mat2.sandwich(inverse[:, :, self._pick(inverse, 1)], self.data, inverse[:, :, self._pick(inverse, 2)])
         flag = self.flag | ~(good[:, :, self._pick(inverse, 1)] & good[:, :, self._pick(inverse, 2)])

@@ -211,7 +211,7 @@ def _plane(cube: StokesCube, stokes: str, channel: int, out: Float | Complex) ->
 def _size(cube: StokesCube, stokes: str) -> float:
     """Largest |value| of a Stokes parameter, or of Q and U."""
     values = cube.data[:, 1:3] if stokes == "P" else cube.data[:, "IQUV".index(stokes)]
-    return float(np.fmax.reduce(np.abs(values), axis=None))
+    return max(float(np.fmax.reduce(np.abs(plane), axis=None)) for plane in values)  # one channel held at a time
 
 
 def _mask(cube: StokesCube, stokes: str, order: Int, infill: bool) -> tuple[Bool, Bool, Float | Complex]:

@@ -146,6 +146,9 @@ def eor_window(
     """The window left by a spectrum of leakage in K; see `Analyzer.eor_window`."""
     if leakage.unit != "K":
         raise InputError(f"the spectrum is in {leakage.unit}, the signal in K: take the spectrum of cube.to_kelvin()")
+    if not np.nan_to_num(leakage.power).any():
+        stokes = leakage.frame.stokes
+        raise InputError(f"the power of Stokes {stokes} is 0 everywhere: no data, which says nothing of a leakage")
     if noise is not None:
         demand_same(leakage, noise)
     least = FINITE.check(float(per_mpc(k_par_min, "k_par_min")), "k_par_min")

@@ -183,3 +183,31 @@ def test_a_table_given_as_a_list_or_text_is_refused_in_our_words(tmp_path, capsy
     said = capsys.readouterr().err
     assert "frequency = '150 MHz' must be a table" in said and "centre" in said
     assert "uv_range = '3,80' must be a list" in said
+
+
+# Inverses and zeros that are no answer -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("d", [1.0, 1e-3, 1e-5, 1e-7, 1e-12])
+def test_data_corrected_with_a_matrix_that_is_almost_singular_are_right_or_flagged(vis, d):
+    """[[1, 1], [1, 1 + d]] put on and taken off left 3 of 3 Jy at 1e-8, unflagged: each inverse loses 1 / d."""
+
+    def same(matrix):
+        values = np.broadcast_to(np.asarray(matrix, complex), (1, 1, len(vis.layout), 2, 2))
+        return ins.JonesTable(values=values, slots_s=vis.at.slots_s[:1], freq_hz=vis.freq_hz[:1])
+
+    bad = same([[1, 1], [1, 1 + d]])
+    back = vis.corrupted(bad).corrected(bad)
+    flag = np.broadcast_to(back.flag, vis.data.shape[:3])
+    assert flag.all() if d < 1e-6 else not flag.any()
+    assert np.abs(back.data - vis.data)[~flag].max(initial=0.0) < 1e-4 * np.abs(vis.data).max()
+    scales = same(np.diag([1e6, 1e-6]))  # nothing cancels here
+    assert not np.any(vis.corrupted(scales).corrected(scales).flag)
+
+
+def test_a_window_over_a_stokes_i_of_zeros_is_refused():
+    data = np.random.default_rng(1).normal(size=(len(FREQ), 4, 16, 16))
+    data[:, 0] = 0
+    refused(
+        lambda: ins.Analyzer(cube(data, constants="data")).eor_window(ins.Signal21cm.table()), "Stokes I", "no data"
+    )
