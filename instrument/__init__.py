@@ -77,7 +77,7 @@ _HOME = {
     "Spherical": "analyze.cylinders",
     "Signal21cm": "analyze.signal",
     "EoRWindow": "analyze.window",
-    "CubeAnalysis": "cube_analysis",
+    "CubeAnalysis": "pipeline.stages.cube",
 }
 _MODULES = ("conformance", "ixr", "mueller", "units")
 __all__ = [*_HOME, *_MODULES, "__version__"]

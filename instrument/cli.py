@@ -135,8 +135,8 @@ def _joined(words: Sequence[str]) -> list[str]:
 
 
 def _scene_file(given: argparse.Namespace) -> Any:
-    from instrument.scene_file import parse
-    from instrument.scene_text import override, read_tables
+    from instrument.pipeline.scene_file import parse
+    from instrument.pipeline.scene_text import override, read_tables
 
     tables = override(read_tables(given.scene), given.settings)
     for key in ("tolerance", "engine"):
@@ -148,7 +148,7 @@ def _scene_file(given: argparse.Namespace) -> Any:
 
 
 def _run(given: argparse.Namespace) -> int:
-    from instrument.run import run
+    from instrument.pipeline.run import run
 
     tables, scene_file = _scene_file(given)
     result = run(
@@ -166,9 +166,9 @@ def _run(given: argparse.Namespace) -> int:
 def _analyze(given: argparse.Namespace) -> int:
     import shlex
 
-    from instrument.analyze_run import Reading, analyze_files
-    from instrument.cube_analysis import CubeAnalysis
-    from instrument.scene_text import override
+    from instrument.pipeline.analyze_files import Reading, analyze_files
+    from instrument.pipeline.scene_text import override
+    from instrument.pipeline.stages.cube import CubeAnalysis
 
     def listed(name: str) -> Any:
         text = getattr(given, name)
@@ -207,7 +207,7 @@ def _plan(given: argparse.Namespace) -> int:
 
 
 def _scenes(given: argparse.Namespace) -> int:
-    from instrument.scene_text import shipped
+    from instrument.pipeline.scene_text import shipped
 
     for name, title in shipped().items():
         show(f"{name:<20} {title}")

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import platform
 from collections.abc import Callable
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
 
-from instrument.run_folder import leftovers
+from instrument.pipeline.folder import leftovers
+from instrument.pipeline.record import package_version
 
 NEEDED = (
     "numpy",
@@ -75,14 +75,6 @@ def self_test() -> float:
             flux = np.abs(problem.sky.brightness(problem.at)).sum(axis=2).max()
             worst = float(np.maximum(worst, np.abs(fast.sums(problem) - slow.sums(problem)).max() / flux))
     return worst
-
-
-def package_version(name: str) -> str:
-    """Version of an installed package, or "not installed"."""
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "not installed"
 
 
 def _memory_gb() -> float:

@@ -1,8 +1,8 @@
 """Plugins by name, found through entry points: `available`, `load`.
 
 Groups: `instrument.elements`, `instrument.telescopes`, `instrument.engines`, `instrument.foregrounds`,
-`instrument.skies`. Entry points are read on first use, never at import. Our own plugins come in by the same door as a
-stranger's.
+`instrument.skies`, `instrument.stages`. Entry points are read on first use, never at import. Our own plugins come in by
+the same door as a stranger's.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 from instrument.checked import checked
 from instrument.errors import PluginError, did_you_mean
 
-KINDS = ("elements", "telescopes", "engines", "foregrounds", "skies")
+KINDS = ("elements", "telescopes", "engines", "foregrounds", "skies", "stages")
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,11 @@ def refresh() -> None:
 
 def _package(point: EntryPoint) -> str:
     return point.dist.name if point.dist else point.module.split(".")[0]
+
+
+def names(kind: str) -> list[str]:
+    """Registered names of a kind, sorted; nothing is imported."""
+    return sorted(_found(kind))
 
 
 @checked

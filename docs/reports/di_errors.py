@@ -14,11 +14,11 @@ from datetime import date
 from importlib.metadata import version
 from pathlib import Path
 
+from instrument.pipeline.run import run
+from instrument.pipeline.scene_file import parse
+from instrument.pipeline.scene_text import override, read_tables
 from instrument.report.spectra import spectra_2d
 from instrument.report.style import save
-from instrument.run import run
-from instrument.scene_file import parse
-from instrument.scene_text import override, read_tables
 
 HERE = Path(__file__).parent
 
@@ -37,20 +37,20 @@ def main():
         tables = override(read_tables("di-errors"), settings)
         with tempfile.TemporaryDirectory() as folder:
             result = run(parse(tables), tables, out=f"{folder}/run", show=print)
-            found = result.calibration
+            found = result.stages["calibrate"]
         times = len(found.solution.term.slots_s)
         for kind, part in (("linear", found.errors.linear), ("quadratic", found.errors.quadratic)):
             for which, values in part.items():
                 if which != "input" and "solution" not in which:
                     cells = " | ".join(f"{v:.2g}" for v in values.values())
                     rows.append(f"| {rms} | {kind}, {which} | {cells} |")
-        record = found.record()
+        record = found.figures()
         for name in ("corrupted - corrected", "corrected - model"):
             seen, image = (100 * record[f"{k}_rms_share"][name] for k in ("visibility", "image"))
             shares.append(f"| {rms} | {name} | {seen:.2g} | {image:.2g} |")
         if rms == "1e-3":
-            curves["corrected, I"] = found.spectra((30, 800))["corrected, I"]
-        curves[f"corrupted - corrected, I, rms {rms}"] = found.spectra((30, 800))["corrupted - corrected, I"]
+            curves["corrected, I"] = found.spectra()["corrected, I"]
+        curves[f"corrupted - corrected, I, rms {rms}"] = found.spectra()["corrupted - corrected, I"]
     save(spectra_2d(curves), HERE / "di_errors.png")
     newline = "\n"
     text = f"""# DI errors and self-calibration: 25 sources of 5 Jy, errors in every term

@@ -20,11 +20,11 @@ import numpy as np
 
 from instrument.analyze.laboratory import IncompleteModel
 from instrument.analyze.sweep import ranks
+from instrument.pipeline.scene_file import parse
+from instrument.pipeline.scene_text import override, read_tables
 from instrument.report.laboratory import errors_against_model
 from instrument.report.spectra import spectra_2d
 from instrument.report.style import save
-from instrument.scene_file import parse
-from instrument.scene_text import override, read_tables
 
 HERE = Path(__file__).parent
 MODELS = (1, 5, 50, 400, 1000)
@@ -52,8 +52,9 @@ def sweep_of(interval, models):
     settings = [f"observation.interval={interval} s", "observation.duration=8 h"]
     file = parse(override(read_tables("3c196"), settings))
     plan = file.scene().plan()
+    imager = file.stages["image"].imager
     begin = time.perf_counter()
-    found = IncompleteModel(models=models, image=file.image).run(plan)
+    found = IncompleteModel(models=models, image=imager).run(plan)
     return found, plan, time.perf_counter() - begin
 
 
@@ -61,9 +62,10 @@ def unmodelled_share():
     """Rms of the image of all sources but 3C196, over that of the whole."""
     file = parse(override(read_tables("3c196"), ["observation.interval=300 s", "observation.duration=8 h"]))
     whole = file.scene()
+    imager = file.stages["image"].imager
     sky = whole.sky.about(whole.observation.phase_centre)
     images = [
-        file.image.image(scene.plan().run().without_beam(scene.instrument)).data[0, 0]
+        imager.image(scene.plan().run().without_beam(scene.instrument)).data[0, 0]
         for scene in (whole, whole.with_fields(sky=sky.select(np.flatnonzero(ranks(sky) > 0))))
     ]
     return images[1].std() / images[0].std()

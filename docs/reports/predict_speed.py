@@ -22,8 +22,8 @@ from peers import DP3, peer_tools, timed
 HERE = Path(__file__).parent
 OURS = """
 import sys, numpy as np
-from instrument.scene_file import parse
-from instrument.scene_text import override, read_tables
+from instrument.pipeline.scene_file import parse
+from instrument.pipeline.scene_text import override, read_tables
 plan = parse(override(read_tables("mock-grid"), [f"observation.duration={sys.argv[1]}"])).scene().plan()
 np.save(sys.argv[2], plan.run().data)
 """
@@ -39,8 +39,8 @@ def main():
         lofar_ms = peer_tools(folder)
         import casacore.tables as tables
 
-        from instrument.scene_file import parse
-        from instrument.scene_text import override, read_tables
+        from instrument.pipeline.scene_file import parse
+        from instrument.pipeline.scene_text import override, read_tables
         from instrument.sky.bbs import write_bbs
 
         file = parse(override(read_tables("mock-grid"), [f"observation.duration={10 * given.times} s"]))

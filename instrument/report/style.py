@@ -12,6 +12,7 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from instrument.report.page import FigureEntry
 from instrument.whole_file import whole_file
 
 P = ParamSpec("P")
@@ -43,6 +44,15 @@ def styled(draw: Callable[P, R]) -> Callable[P, R]:
 def axes_of(ax: Axes | None, size: tuple[float, float]) -> Axes:
     """The axes given, or those of a new figure of a size in inches."""
     return ax if ax is not None else Figure(figsize=size).add_subplot()
+
+
+def drawer(folder: Path) -> Callable[..., FigureEntry]:
+    """A function (name, drawing, caption, wide) that writes a figure into a folder and gives the entry of its page."""
+
+    def draw(name: str, drawing: Figure | Axes, caption: str, wide: bool = False) -> FigureEntry:
+        return FigureEntry(save(drawing, folder / f"{name}.png"), caption, wide=wide)
+
+    return draw
 
 
 def save(drawing: Figure | Axes, path: str | os.PathLike[str]) -> Path:

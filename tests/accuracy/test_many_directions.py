@@ -10,8 +10,8 @@ import instrument
 from instrument import GainTerm, InputError, Observation, PointSky, Scene
 from instrument.analyze.many_directions import ManyDirections, cluster_of
 from instrument.calibrate.directional import DirectionalCal
-from instrument.scene_file import parse
-from instrument.scene_text import override, read_tables
+from instrument.pipeline.scene_file import parse
+from instrument.pipeline.scene_text import override, read_tables
 
 CENTRE = SkyCoord("08h13m36.0s +48d13m03s")
 PLACES = np.array([(0, 0), (2, 1), (-1.5, 2), (-2, -1.8)])  # deg

@@ -81,7 +81,7 @@ def test_examples_are_listed_on_the_index():
 
 @pytest.mark.parametrize("page", named(PAGES, lambda page: blocks(page, "toml")))
 def test_toml_blocks_are_scene_files_or_entry_points(page):
-    from instrument.scene_file import parse
+    from instrument.pipeline.scene_file import parse
 
     for _, text in blocks(page, "toml"):
         tables = tomllib.loads(text)

@@ -27,7 +27,7 @@ def cube(freq=FREQ, depth=2.0, noise=0.03, unit="K", pixels=24, psf=None, seed=0
 @pytest.fixture
 def run(tmp_path, capsys, monkeypatch):
     """Runs `analyze` on a cube, without figures; run.json, what was said, the folder."""
-    monkeypatch.setattr("instrument.report.cube_page.cube_sections", lambda result, folder: [])
+    monkeypatch.setattr("instrument.pipeline.stages.cube_page.cube_sections", lambda result, folder: [])
 
     def call(given, *words, status=0, more=()):
         path = tmp_path / "cube.fits"
@@ -171,7 +171,7 @@ def test_f14_a_check_that_cannot_be_made_is_said():
     data[11] = np.nan
     result = CubeAnalysis(products=["spherical"], infill=300 * u.ns, bins=4).run(given.with_data(data))
     assert result.passed and result.verdicts["power spectrum of I"] is None
-    assert "check         power spectrum of I: not made" in result.lines_of_text()
+    assert "check         power spectrum of I: not made" in result.lines()
 
 
 def test_g9_a_redshift_of_another_band_is_warned_of():

@@ -60,7 +60,7 @@ def test_i12_every_error_is_one_line_and_a_status(error, status, line, capsys):
 
 
 def test_i12_a_stop_after_the_folder_was_moved_says_that_it_is_written(tmp_path, capsys, monkeypatch):
-    from instrument.run_folder import RunFolder
+    from instrument.pipeline.folder import RunFolder
 
     monkeypatch.chdir(tmp_path)
 

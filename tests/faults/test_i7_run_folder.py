@@ -6,9 +6,9 @@ import sys
 
 import pytest
 
-from instrument import run_folder
 from instrument.errors import InputError, InstrumentWarning
-from instrument.run_folder import PARTIAL, RunFolder, leftovers
+from instrument.pipeline import folder as run_folder
+from instrument.pipeline.folder import PARTIAL, RunFolder, leftovers
 
 
 @pytest.fixture(autouse=True)
@@ -109,7 +109,7 @@ def test_i7_a_failed_run_leaves_nothing_not_even_folders_made_for_it(here):
 
 def test_g6_what_a_killed_run_left_is_removed_by_the_next_and_named(here):
     script = (
-        "import os, signal\nfrom instrument.run_folder import RunFolder\n"
+        "import os, signal\nfrom instrument.pipeline.folder import RunFolder\n"
         "with RunFolder('scene', 'o') as folder:\n"
         "    (folder.partial / 'cube.fits').write_bytes(b'0' * 1000)\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"

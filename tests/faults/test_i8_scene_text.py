@@ -6,7 +6,7 @@ import pytest
 
 from instrument.cli import main
 from instrument.errors import InputError
-from instrument.scene_text import override, read_tables, to_toml
+from instrument.pipeline.scene_text import override, read_tables, to_toml
 
 TINY = """name = "tiny"
 title = "caf\xe9"

@@ -8,7 +8,7 @@ from astropy.table import QTable
 
 from instrument import read_h5parm
 from instrument.cli import main
-from instrument.scene_text import shipped
+from instrument.pipeline.scene_text import shipped
 
 
 def ran(tmp_path, name, *settings):

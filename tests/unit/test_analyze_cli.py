@@ -13,8 +13,8 @@ from instrument.analyze.cells import cells_of
 from instrument.analyze.cube_checks import check_cells, check_faraday
 from instrument.analyze.faraday import rm_synthesis
 from instrument.cli import main
-from instrument.cube_analysis import CubeAnalysis
 from instrument.image.cube import Psf
+from instrument.pipeline.stages.cube import CubeAnalysis
 
 FREQ = (140e6 + 1e6 * np.arange(24)) * u.Hz
 

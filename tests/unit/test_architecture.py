@@ -22,10 +22,10 @@ HEAVY = {"astropy", "scipy", "numba", "matplotlib", "ducc0", "h5py", "jinja2", "
 # stands for a module or for a whole package.
 LAYERS = (
     ("errors", "data", "scenes"),
-    ("numbers", "run_folder", "compiled", "terminal", "whole_file"),
+    ("numbers", "compiled", "terminal", "whole_file"),
     ("units", "checked"),
     ("files_in", "memory"),
-    ("registry", "mat2", "phasor", "scene_text"),
+    ("registry", "mat2", "phasor"),
     ("component",),
     ("plugin_settings",),
     ("observe",),
@@ -42,16 +42,11 @@ LAYERS = (
     ("image",),
     ("analyze",),
     ("foreground",),
-    ("cube_results",),
-    ("cube_analysis",),
     ("files",),
     ("report",),
-    ("scene_file",),
+    ("pipeline",),
     ("conformance", "conformance_bench", "conformance_terms", "conformance_engines", "conformance_foregrounds"),
-    ("calibration_run",),
     ("doctor",),
-    ("run_record",),
-    ("run", "analyze_run"),
     ("",),  # `instrument` itself, which looks names up in all of them when they are first used
     ("cli",),
 )

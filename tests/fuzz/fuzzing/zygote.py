@@ -129,11 +129,11 @@ def main():
     import matplotlib.pyplot
     import yaml
 
-    import instrument.analyze_run
-    import instrument.run
+    import instrument.pipeline.analyze_files
+    import instrument.pipeline.run
     from instrument import cli
 
-    assert all((astropy.io.votable, h5py, yaml, matplotlib.pyplot, instrument.run))
+    assert all((astropy.io.votable, h5py, yaml, matplotlib.pyplot, instrument.pipeline.run))
     for words in json.loads(sys.argv[1]):
         status = cli.main(words)
         assert status in (0, 3), (words, status)

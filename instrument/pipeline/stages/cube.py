@@ -18,11 +18,11 @@ from instrument.analyze.fourier import Stokes, Taper
 from instrument.analyze.signal import DEFAULT, Signal21cm
 from instrument.checked import checked
 from instrument.component import Component
-from instrument.cube_results import CubeResults
 from instrument.errors import InputError, InstrumentWarning, unused, warn
 from instrument.foreground.base import ForegroundRemover
 from instrument.image.cube import StokesCube
 from instrument.memory import afford
+from instrument.pipeline.stages.cube_results import CubeResults
 from instrument.registry import load
 from instrument.units import Count, Finite, Float, NotNegative, Positive, PositiveSeconds, Radians, Real, UvRange
 
@@ -265,10 +265,10 @@ class CubeAnalysis(Component):
             alone: tuple[Stokes, ...] = ("I", "P", "V")
             for stokes in alone:
                 if stokes == "P" or np.nan_to_num(spectrum[:, "IQUV".index(stokes)]).any():
-                    result.lines[stokes] = Analyzer(pixel).rm_synthesis(axis, stokes=stokes, weights=self.weights)
+                    result.sights[stokes] = Analyzer(pixel).rm_synthesis(axis, stokes=stokes, weights=self.weights)
             if result.cleaned is not None:
-                result.lines["P cleaned"] = replace(
-                    result.lines["P"], data=result.cleaned.restored[:, y : y + 1, x : x + 1]
+                result.sights["P cleaned"] = replace(
+                    result.sights["P"], data=result.cleaned.restored[:, y : y + 1, x : x + 1]
                 )
 
     def _split(self, cube: StokesCube, result: CubeResults) -> None:

@@ -21,10 +21,12 @@ from instrument.analyze.window import EoRWindow
 from instrument.errors import InputError, Outcome
 from instrument.foreground.base import Split
 from instrument.image.cube import StokesCube
+from instrument.pipeline.stage import Draw, StageResult
+from instrument.report.page import Section
 
 
 @dataclass
-class CubeResults:
+class CubeResults(StageResult):
     """What was made of a cube: spectra by name, windows, Faraday cube, what was left out and why, seconds."""
 
     settings: Any  # the `CubeAnalysis` that made it
@@ -33,7 +35,7 @@ class CubeResults:
     cleaned: FaradayClean | None = None
     peaks: FaradayPeaks | None = None
     brightest: tuple[int, ...] = ()
-    lines: dict[str, FaradayCube] = field(default_factory=dict)
+    sights: dict[str, FaradayCube] = field(default_factory=dict)
     split: Split | None = None
     said: str = ""
     planes: dict[str, Spectrum2D] = field(default_factory=dict)
@@ -78,8 +80,11 @@ class CubeResults:
         except InputError:  # too few channels or pixels for a score: said in the text
             return None
 
-    def lines_of_text(self) -> list[str]:
+    def lines(self) -> list[str]:
         """What matters, for the terminal."""
+        return ["", *self._text(), ""]
+
+    def _text(self) -> list[str]:
         shape = self.cube.data.shape
         low, high = self.cube.freq_hz.min() / 1e6, self.cube.freq_hz.max() / 1e6
         out = [f"cube          {shape[0]} channels {low:.6g} to {high:.6g} MHz, {shape[3]} x {shape[2]} pixels, "
@@ -124,7 +129,18 @@ class CubeResults:
         return out
 
     def record(self) -> dict[str, Any]:
-        """What `run.json` holds of it."""
+        """Its checks, and what was found, under "cube"."""
+        found = self.figures()
+        return {"checks": found.pop("checks"), "stage_errors": found.pop("stage_errors"), "cube": found}
+
+    def sections(self, draw: Draw) -> list[Section]:
+        """Faraday depth, removal, spectra, window."""
+        from instrument.pipeline.stages.cube_page import cube_sections
+
+        return cube_sections(self, draw)
+
+    def figures(self) -> dict[str, Any]:
+        """Settings, what was left out, checks, and the numbers of every product."""
         out: dict[str, Any] = {"settings": self.settings.to_dict(), "left_out": self.left_out, "warnings": self.warned}
         if self.faraday is not None and self.peaks is not None:
             band = self.faraday.band

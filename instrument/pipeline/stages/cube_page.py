@@ -2,38 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 
 from instrument.analyze.faraday_cube import FaradayCube
 from instrument.analyze.ixr import removal_table
 from instrument.analyze.signal import Signal21cm
-from instrument.cube_results import CubeResults
+from instrument.pipeline.stage import Draw
+from instrument.pipeline.stages.cube_results import CubeResults
 from instrument.report.cylinders import cylinder, cylinder_ratio, spheres
-from instrument.report.page import Block, FigureEntry, Figures, Section, Table, Text, number
+from instrument.report.page import Block, Figures, Section, Table, Text, number
 from instrument.report.spectra import spectra_2d
-from instrument.report.style import save
 from instrument.units import Float
 
 
-def cube_sections(result: CubeResults, folder: Path) -> list[Section]:
-    """Sections of a page, their figures drawn into a folder."""
-    sections = [_cube(result)]
-
-    def figure(name: str, drawing: Any, caption: str, wide: bool = False) -> FigureEntry:
-        return FigureEntry(save(drawing, folder / f"{name}.png"), caption, wide=wide)
-
-    for make in (_faraday, _removal, _spectra, _window):
-        section = make(result, figure)
-        if section is not None:
-            sections.append(section)
-    return sections
-
-
-Draw = Callable[..., FigureEntry]
+def cube_sections(result: CubeResults, draw: Draw) -> list[Section]:
+    """Sections of a page, their figures drawn by `draw`; the window first, for it is what the others are made for."""
+    made = (make(result, draw) for make in (_window, _spectra, _faraday, _removal))
+    return [*(section for section in made if section is not None), _cube(result)]
 
 
 def _cube(result: CubeResults) -> Section:
@@ -76,7 +61,7 @@ def _faraday(result: CubeResults, figure: Draw) -> Section | None:
             )
         )
     y, x = result.brightest
-    line = lines_of_sight(result.lines)
+    line = lines_of_sight(result.sights)
     line.set_title(f"pixel ({x}, {y}), the brightest")
     text = "Faraday spectra of the brightest pixel: Q + iU, and Stokes I and V where they have data."
     entries = [

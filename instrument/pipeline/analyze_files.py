@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import platform
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -13,18 +12,17 @@ from typing import Any
 
 import numpy as np
 
-from instrument.cube_analysis import CubeAnalysis
-from instrument.cube_results import CubeResults
-from instrument.doctor import package_version
 from instrument.errors import InputError, unused, unused_ledger
 from instrument.files.fits import read_cube
 from instrument.files.fits_psf import read_psf
 from instrument.files.number_list import read_frequencies, read_numbers
 from instrument.image.channels import channel_numbers, in_band
 from instrument.image.cube import Psf, StokesCube
-from instrument.report.progress import progress_bar
-from instrument.run_folder import RunFolder
-from instrument.run_record import PACKAGES, json_ready
+from instrument.pipeline.folder import RunFolder
+from instrument.pipeline.progress import progress_bar
+from instrument.pipeline.record import json_text, versions
+from instrument.pipeline.stages.cube import CubeAnalysis
+from instrument.pipeline.stages.cube_results import CubeResults
 from instrument.units import Float
 
 OPTIONS = {  # what refusals ask for, as they do in Python and as it is written here
@@ -128,7 +126,7 @@ def analyze_files(
                 _write(result, paths, command, folder.partial, ledger)
             path = folder.finish()
     spent = ", ".join(f"{name} {seconds:.1f}" for name, seconds in sorted(result.seconds.items(), key=lambda s: -s[1]))
-    lines = [*result.lines_of_text(), "", f"time          {sum(result.seconds.values()):.1f} s ({spent})"]
+    lines = [*result.lines(), f"time          {sum(result.seconds.values()):.1f} s ({spent})"]
     show("\n".join([*lines, f"written       {path}/report.html, run.json, tables and figures"]))
     return result
 
@@ -163,9 +161,9 @@ def _beam(text: str, cube: StokesCube) -> Psf:
 
 
 def _write(result: CubeResults, paths: Sequence[str], command: str, folder: Path, ledger: dict[str, list[str]]) -> None:
-    from instrument.report.cube_page import cube_sections
     from instrument.report.page import write_page
     from instrument.report.run_page import page_of_run
+    from instrument.report.style import drawer
 
     result.write(folder)
     record = {
@@ -175,11 +173,11 @@ def _write(result: CubeResults, paths: Sequence[str], command: str, folder: Path
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "files": [str(Path(p).name) for p in paths],
         "command": command,
-        "versions": {"python": platform.python_version(), **{p: package_version(p) for p in PACKAGES}},
+        "versions": versions(),
         "machine": {"system": platform.platform()},
         "unused": ledger,
         "seconds": {k: round(v, 3) for k, v in result.seconds.items()},
-        **result.record(),
+        **result.figures(),
     }
-    write_page(page_of_run(record, more=cube_sections(result, folder)), folder / "report.html")
-    (folder / "run.json").write_text(json.dumps(json_ready(record), indent=2, allow_nan=False), encoding="utf-8")
+    write_page(page_of_run(record, sections=result.sections(drawer(folder))), folder / "report.html")
+    (folder / "run.json").write_text(json_text(record), encoding="utf-8")

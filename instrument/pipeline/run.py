@@ -1,0 +1,128 @@
+"""A scene file run end to end: a loop over the stages that are there, a check, and the run folder."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from instrument.errors import unused_ledger
+from instrument.pipeline.folder import RunFolder
+from instrument.pipeline.progress import progress_bar
+from instrument.pipeline.record import Result, json_text, record, summary
+from instrument.pipeline.scene_file import SceneFile
+from instrument.pipeline.scene_text import to_toml
+from instrument.pipeline.stage import Running, StageRun
+from instrument.pipeline.stages.receivers import NAME, Receivers
+
+PREDICT = "predict"
+
+
+def run(
+    scene_file: SceneFile,
+    tables: dict[str, Any],
+    out: str | None = None,
+    memory: str | None = None,
+    workers: int | None = None,
+    verify: bool = True,
+    show: Callable[[str], None] = lambda text: None,
+) -> Result:
+    """Run a scene file and write its folder; everything is written beside it first and moved there at the end.
+
+    `tables` are the TOML tables it was made from. Raises `InputError` before anything is computed or written when the
+    scene or the folder will not do.
+    """
+    folder = RunFolder(scene_file.name, out)
+    with unused_ledger() as ledger:
+        result = _planned(scene_file, folder.path, memory, workers, verify)
+        result.unused = ledger
+        show(str(result.plan))
+        with folder:
+            _compute(result)
+            if verify:
+                result.check = result.plan.check
+                _book(result)
+            with result.timed("write"):
+                _write(result, tables, folder.partial)
+            result.folder = folder.finish()
+    show(summary(result))
+    return result
+
+
+def _planned(scene_file: SceneFile, path: Path, memory: str | None, workers: int | None, verify: bool) -> Result:
+    """What will be filled: the scene and its plan."""
+    begin = time.perf_counter()
+    scene = scene_file.scene()
+    plan = scene_file.plan(scene, memory, workers)
+    if verify:  # the blocks as the stages get them, before any corruption
+        plan = plan.watched(samples=64, seed=scene_file.seed)
+    return Result(scene_file, scene.instrument, plan, path, seconds={"plan": time.perf_counter() - begin})
+
+
+def _book(result: Result) -> None:
+    """Give the check the seconds that it took of the stage whose blocks it saw."""
+    spent = result.plan.checker.spent if result.plan.checker else 0.0
+    result.seconds[result.scene.alone or PREDICT] -= spent
+    result.seconds["verify"] = spent
+
+
+def _compute(result: Result) -> None:
+    """Stream the blocks through the stages that the scene has."""
+    stages = result.scene.running
+    run = Running(result.scene.name, result.scene.seed, result.instrument, result.plan, stages, parts=result.parts)
+    work: dict[str, StageRun] = {}
+    if any(stage.perfect for stage in stages.values()):
+        work[NAME] = Receivers(result.instrument)
+    for name, stage in stages.items():
+        with _at_work(result, run, name):
+            work[name] = stage.start(run)
+    alone = result.scene.alone
+    named = ", ".join([PREDICT, *work] if alone is None else [alone])
+    with progress_bar(f"{result.scene.name}: {named}") as update:
+        others, begin = sum(result.seconds.values()), time.perf_counter()
+        blocks = result.plan.blocks(progress=update) if alone is None else work[alone].blocks(update)
+        for block in blocks:
+            run.model = block
+            for name, one in work.items():
+                with _at_work(result, run, name):
+                    block = one.take(block)
+        spent = time.perf_counter() - begin - (sum(result.seconds.values()) - others)
+        source = alone or PREDICT
+        result.seconds[source] = result.seconds.get(source, 0.0) + spent
+    run.model = None
+    for name, one in work.items():
+        with _at_work(result, run, name):
+            run.results[name] = one.finish()
+    result.stages = run.results
+
+
+@contextmanager
+def _at_work(result: Result, run: Running, name: str) -> Iterator[None]:
+    """Time what a stage does as its own."""
+    run.now = name
+    with result.timed(name):
+        yield
+
+
+def _write(result: Result, tables: dict[str, Any], folder: Path) -> None:
+    """Everything of the run folder: scene, what the stages write, run.json, figures, report."""
+    from instrument.report.page import write_page
+    from instrument.report.run_page import page_of_run
+    from instrument.report.style import drawer
+
+    (folder / "scene.toml").write_text(to_toml(tables), encoding="utf-8")
+    for stage in result.stages.values():
+        stage.write(folder)
+    what = record(result, tables)
+    draw = drawer(folder)
+    made = list(result.stages.values())
+    page = page_of_run(
+        what,
+        cards=[card for stage in made for card in stage.cards()],
+        sections=[section for stage in reversed(made) for section in stage.sections(draw)],
+        tables=[section for stage in made for section in stage.tables()],
+    )
+    write_page(page, folder / "report.html")
+    (folder / "run.json").write_text(json_text(what), encoding="utf-8")

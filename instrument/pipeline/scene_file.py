@@ -1,0 +1,230 @@
+"""Scene files: TOML tables, one per stage, read and checked before anything runs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+from typing import Annotated, Any, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from instrument.component import Component
+from instrument.errors import InputError, did_you_mean, unused
+from instrument.jones.feed import FeedTerm
+from instrument.jones.gain import GainTerm
+from instrument.model import Instrument
+from instrument.numbers import Seed, Tolerance, Whole, brief
+from instrument.observe.observation import Observation
+from instrument.pipeline.stage import SEED_STEP, Beside, Stage, in_order
+from instrument.plan import Item, Plan
+from instrument.registry import available, load, names, plugin_class
+from instrument.scene import Scene
+from instrument.sky.base import Sky
+from instrument.units import Float, Hertz, HertzArray, Instant, PositiveHertz, Seconds, SkyDirection
+
+MOST_CHANNELS = 1_000_000
+
+
+class Frequency(Component):
+    """Channels: `centre` of the band, `width` of one channel (also their spacing), how many."""
+
+    centre: PositiveHertz
+    width: PositiveHertz
+    channels: Annotated[int, Whole(at_least=1, at_most=MOST_CHANNELS)] = 1
+
+    def values_hz(self) -> Float:
+        """Channel centres, Hz (F,)."""
+        return np.asarray(self.centre + self.width * (np.arange(self.channels) - (self.channels - 1) / 2))
+
+
+class ObservationTable(Component):
+    """The table [observation]: an `Observation`, its channels as `frequency` or as a list `frequencies`."""
+
+    phase_centre: SkyDirection
+    start: Instant | None = None
+    transit: str | None = None
+    duration: Seconds
+    interval: Seconds
+    frequency: Frequency | None = None
+    frequencies: HertzArray | None = None
+    channel_width: Hertz | None = None
+
+    def observation(self) -> Observation:
+        """The observation it describes."""
+        from astropy import units as u
+
+        if (self.frequency is None) == (self.frequencies is None):
+            raise InputError("[observation] needs 'frequency' or 'frequencies', and not both")
+        values = self.frequency.values_hz() if self.frequency else self.frequencies
+        width = self.frequency.width if self.frequency else self.channel_width
+        return Observation(
+            phase_centre=self.phase_centre,
+            start=self.start,
+            transit=self.transit,
+            duration=self.duration * u.s,
+            interval=self.interval * u.s,
+            frequencies=np.asarray(values) * u.Hz,
+            channel_width=None if width is None else width * u.Hz,
+        )
+
+
+class SceneFile(Component):
+    """A scene file: `instrument`, `observation` and `sky`, and the `tables` of the stages that follow.
+
+    A table names a stage, by its plugin: `[noise]`, `[image]`. With `kind = K` in it the stage "TABLE.K" is taken where
+    there is one. An absent table is a stage that is left out.
+    """
+
+    name: str
+    title: str = ""
+    seed: Seed = 0
+    tolerance: Tolerance = 0.0
+    engine: str | None = None
+    instrument: dict[str, Any]
+    observation: ObservationTable
+    sky: dict[str, Any]
+    tables: dict[str, dict[str, Any]] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _stages_fit(self) -> Self:
+        # wrong settings of a stage are refused before anything is planned
+        self.stages  # noqa: B018
+        odd = not self.name.isprintable() or self.name != self.name.strip() or len(self.name.encode()) > 200
+        if not self.name or odd or any(c in self.name for c in "/\\") or self.name.startswith("."):
+            raise InputError(f"name = {brief(self.name)} cannot name a folder")
+        return self
+
+    @cached_property
+    def stages(self) -> dict[str, Stage]:
+        """Every stage that is there, by its table, in the order of the run."""
+        table = self.observation
+        width = table.frequency.width if table.frequency else table.channel_width
+        beside = Beside(self.seed, self.tables, width)
+        return in_order({name: _stage(name, settings, beside) for name, settings in self.tables.items()})
+
+    @property
+    def alone(self) -> str | None:
+        """The stage that makes its own blocks, if there is one: no other runs."""
+        return next((name for name, stage in self.stages.items() if stage.alone is not None), None)
+
+    @property
+    def running(self) -> dict[str, Stage]:
+        """The stages that run, in order."""
+        return self.stages if self.alone is None else {self.alone: self.stages[self.alone]}
+
+    def telescope(self) -> Instrument:
+        """The instrument of the table [instrument]."""
+        settings = dict(self.instrument)
+        name = settings.pop("telescope", None)
+        if name is None:
+            raise InputError(f"[instrument] needs 'telescope': one of {', '.join(available('telescopes'))}")
+        for step, (key, cls) in enumerate((("gain", GainTerm), ("feed", FeedTerm)), start=1):
+            if isinstance(settings.get(key), dict):
+                with _in_table(f"instrument.{key}"):
+                    settings[key] = cls(**{"seed": SEED_STEP * self.seed + step, **settings[key]})
+        with _in_table("instrument"):
+            found: Instrument = load("telescopes", name, **settings)
+        return found
+
+    def sky_model(self) -> Sky:
+        """The sky of the table [sky]."""
+        settings = dict(self.sky)
+        kind = settings.pop("kind", None)
+        if kind is None:
+            raise InputError(f"[sky] needs 'kind': one of {', '.join(available('skies'))}")
+        with _in_table("sky"):
+            found: Sky = load("skies", kind, **settings)
+        return found
+
+    def scene(self) -> Scene:
+        """The scene: instrument, sky and observation."""
+        with _in_table("observation"):
+            observation = self.observation.observation()
+        return Scene(name=self.name, instrument=self.telescope(), sky=self.sky_model(), observation=observation)
+
+    def products_uv_range(self) -> tuple[float, float] | None:
+        """The uv range, in wavelengths, that holds all the products asked for; `None` when one needs all baselines."""
+        ranges = [r for stage in self.running.values() for r in stage.ranges()]
+        given = [r for r in ranges if r is not None]
+        if not given or len(given) < len(ranges):
+            return None
+        return min(r[0] for r in given), max(r[1] for r in given)
+
+    def plan(self, scene: Scene, memory: Any = None, workers: int | None = None) -> Plan:
+        """The plan of its scene: baselines that no product needs and stages that are absent are left out.
+
+        A stage that is `perfect` has the prediction without errors of receivers, which it gets block by block. What a
+        table asks for and no stage takes is named in a warning.
+        """
+        self._say_unused()
+        for name, stage in self.running.items():
+            with _in_table(name):
+                stage.check(scene)
+        if any(stage.perfect for stage in self.running.values()):
+            scene = scene.with_fields(instrument=scene.instrument.with_fields(gain=None, feed=None))
+        found = scene.plan(
+            tolerance=self.tolerance,
+            engine=self.engine,
+            memory=memory,
+            workers=workers,
+            uv_range=self.products_uv_range(),
+        )
+        absent = [name for name in top_level() if name not in self.stages]
+        items = (Item(", ".join(absent), "absent from the scene"),) if absent else ()
+        return replace(found, left_out=found.left_out + items)
+
+    def _say_unused(self) -> None:
+        """Name tables and keys that nothing will take."""
+        alone = self.alone
+        if alone is not None:
+            taken = (alone, *(self.stages[alone].alone or ()))
+            given = [f"[{table}]" for table in self.tables if table not in taken]
+            kind = self.tables[alone].get("kind", alone)
+            unused("scene", given, f"a laboratory, [{alone}] kind = '{kind}', makes its own figures")
+        if self.observation.frequency is not None and self.observation.channel_width is not None:
+            unused("[observation]", ["channel_width"], "'frequency' has its width")
+
+
+def top_level() -> list[str]:
+    """Names of the tables that stages take, in the order of a run."""
+    return [name for name in names("stages") if "." not in name]
+
+
+def _stage(name: str, settings: dict[str, Any], beside: Beside) -> Stage:
+    """The stage of a table: "TABLE.KIND" where there is one, else "TABLE", which may take its kind."""
+    kind, known = settings.get("kind"), names("stages")
+    with _in_table(name):
+        if f"{name}.{kind}" in known:
+            name, settings = f"{name}.{kind}", {key: value for key, value in settings.items() if key != "kind"}
+        cls: type[Stage] = plugin_class("stages", name, needed=True)
+        return cls.from_table(settings, beside)
+
+
+class _in_table:
+    """Says in an error of which table of the scene file it is."""
+
+    def __init__(self, table: str) -> None:
+        self.table = table
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        if isinstance(error, InputError) and not str(error).startswith("["):
+            raise type(error)(f"[{self.table}] {error}") from None
+
+
+def parse(tables: dict[str, Any]) -> SceneFile:
+    """Tables as a checked `SceneFile`; raises `InputError` naming the key, the value and the nearest right one."""
+    own = {name for name in SceneFile.model_fields if name != "tables"}
+    known = top_level()
+    for name, value in tables.items():
+        if name not in own and name not in known:
+            raise InputError(f"SceneFile has no '{name}': {did_you_mean(name, [*own, *known])}")
+        if (name in known or name in ("instrument", "observation", "sky")) and not isinstance(value, dict):
+            raise InputError(f"'{name}' must be a table, [{name}]")
+    return SceneFile(
+        **{name: value for name, value in tables.items() if name in own},
+        tables={name: value for name, value in tables.items() if name in known},
+    )

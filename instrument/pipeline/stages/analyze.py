@@ -1,0 +1,110 @@
+"""The table [analyze]: leakage of sources, spectra of images, and [analyze.cube]: what is made of the cube."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Self
+
+from instrument.analyze.analyzer import Analyzer
+from instrument.analyze.photometry import ForcedPhotometry
+from instrument.analyze.spectra import Spectrum2D
+from instrument.errors import InputError, unused
+from instrument.pipeline.stage import Beside, Draw, Running, Several, Stage, StageResult, StageRun
+from instrument.pipeline.stages.cube import CubeAnalysis
+from instrument.pipeline.stages.image import ImageResult
+from instrument.pipeline.stages.leakage import LeakageRun
+from instrument.report.page import Figures, Section
+from instrument.scene import Scene
+from instrument.units import Count, UvRange
+from instrument.visibilities import Visibilities
+
+STOKES: tuple[Literal["I", "P", "V"], ...] = ("I", "P", "V")
+
+
+class Analyze(Stage):
+    """What is made of sources and images: products, settings of forced photometry, and the analysis of the cube."""
+
+    after: ClassVar[tuple[str, ...]] = ("noise", "calibrate", "correct", "image")
+    products: tuple[Literal["leakage", "spectrum-2d"], ...] = ("leakage",)
+    uv_range: UvRange | None = None
+    every: Count = 1
+    cube: CubeAnalysis | None = None
+
+    @classmethod
+    def from_table(cls, settings: Mapping[str, Any], beside: Beside) -> Self:
+        """The stage; raises `InputError` where products need images and there are none."""
+        found = cls(**settings)
+        if "spectrum-2d" in found.products and "image" not in beside.tables:
+            raise InputError("[analyze] products = ['spectrum-2d'] needs images: give a table [image]")
+        if found.cube and "image" not in beside.tables:
+            raise InputError("[analyze.cube] needs images: give a table [image]")
+        return found
+
+    def ranges(self) -> tuple[tuple[float, float] | None, ...]:
+        """That of the photometry, where there is one."""
+        return (self.uv_range,) if "leakage" in self.products else ()
+
+    def check(self, scene: Scene) -> None:
+        """Name settings of products that are not made."""
+        if "leakage" not in self.products:
+            given = [key for key in ("uv_range", "every") if key in self.model_fields_set]
+            unused("[analyze]", given, "they are of the product 'leakage'")
+
+    def start(self, run: Running) -> StageRun:
+        """The stage at work."""
+        return _AnalyzeRun(self, run)
+
+
+class _AnalyzeRun(StageRun):
+    def __init__(self, settings: Analyze, run: Running) -> None:
+        self.settings, self.run = settings, run
+        photometry = ForcedPhotometry(uv_range=settings.uv_range, every=settings.every)
+        self.leakage = LeakageRun(run, photometry) if "leakage" in settings.products else None
+
+    def take(self, block: Visibilities) -> Visibilities:
+        """Measure the sources in a block."""
+        return block if self.leakage is None else self.leakage.take(block)
+
+    def finish(self) -> StageResult:
+        """Leakage, spectra, and the products of the cube."""
+        found: list[StageResult] = [] if self.leakage is None else [self.leakage.finish()]
+        if "spectrum-2d" in self.settings.products:
+            found.append(self._spectra())
+        if self.settings.cube is not None:
+            products = self.settings.cube.run(self._images().cube)
+            self.run.parts.setdefault(self.run.now, {}).update(products.seconds)
+            found.append(products)
+        return Several(found)
+
+    def _images(self) -> ImageResult:
+        return self.run.result("image", ImageResult)
+
+    def _spectra(self) -> SpectraResult:
+        images = self._images()
+        uv_range = images.imager.uv_range
+        with self.run.timed("2D spectra"):
+            made = {s: Analyzer(images.cube).spectrum_2d(stokes=s, uv_range=uv_range, taper="hann") for s in STOKES}
+        return SpectraResult(made)
+
+
+@dataclass(frozen=True)
+class SpectraResult(StageResult):
+    """2D power spectra of the images of a run, by Stokes parameter."""
+
+    spectra: dict[str, Spectrum2D]
+
+    def write(self, folder: Path) -> None:
+        """spectrum_2d_I.ecsv, ..."""
+        for stokes, spectrum in self.spectra.items():
+            spectrum.write(folder / f"spectrum_2d_{stokes}.ecsv")
+
+    def sections(self, draw: Draw) -> list[Section]:
+        """The spectra in one figure."""
+        from instrument.report.spectra import spectra_2d
+
+        text = "2D power spectra of the images, Hann taper; the PSF stays."
+        return [
+            Section("Power spectra of the images", [Figures([draw("spectrum_2d", spectra_2d(self.spectra), text)])])
+        ]

@@ -1,0 +1,195 @@
+"""The table [calibrate]: blocks solved against the model they were made from, corrected, and what that leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Self
+
+import numpy as np
+
+from instrument.analyze.analyzer import Analyzer
+from instrument.calibrate.base import Solution
+from instrument.calibrate.di_errors import DIComparison, DISums
+from instrument.calibrate.selfcal import SelfCal
+from instrument.errors import InputError, Outcome, did_you_mean
+from instrument.files.solutions import write_h5parm
+from instrument.image.cube import StokesCube
+from instrument.image.dirty import Images
+from instrument.jones.chain import Chain
+from instrument.pipeline.stage import Beside, Draw, Running, Stage, StageResult, StageRun
+from instrument.pipeline.stages.image import Image
+from instrument.registry import names
+from instrument.report.page import Block, Figures, Section, Table, Text
+from instrument.visibilities import Visibilities
+from instrument.whole_file import write_ecsv
+
+IMAGES = ("corrupted", "corrected", "corrupted - corrected", "corrected - model")
+
+
+class Calibrate(Stage):
+    """Solves every block against what a perfect instrument sees, and corrects it.
+
+    The settings of the table are those of the solver.
+    """
+
+    after: ClassVar[tuple[str, ...]] = ("noise",)
+    perfect: ClassVar[bool] = True
+    calibrator: SelfCal
+
+    @classmethod
+    def from_table(cls, settings: Mapping[str, Any], beside: Beside) -> Self:
+        """The stage; the settings are those of the solver."""
+        kind = settings.get("kind")
+        if kind != "selfcal":
+            known = ["selfcal", *(n.partition(".")[2] for n in names("stages") if n.startswith("calibrate."))]
+            raise InputError(f"kind = {kind!r}: {did_you_mean(str(kind), known)}")
+        return cls(calibrator=SelfCal(**{key: value for key, value in settings.items() if key != "kind"}))
+
+    def start(self, run: Running) -> StageRun:
+        """The stage at work."""
+        image = run.stage("image", Image)
+        images = {} if image is None else {name: image.sums(run) for name in IMAGES}
+        return _CalibrateRun(self.calibrator, run, images)
+
+
+@dataclass
+class _CalibrateRun(StageRun):
+    """Keeps solutions, sums of errors, and difference images."""
+
+    solver: SelfCal
+    run: Running
+    images: dict[str, Images]
+    parts: list[Solution] = field(default_factory=list)
+    errors: DISums | None = None
+    power: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def _rms(self) -> float:
+        """That of the errors put in."""
+        instrument = self.run.instrument
+        return max((t.rms for t in (instrument.gain, instrument.feed) if t is not None), default=0.0)
+
+    def take(self, block: Visibilities) -> Visibilities:
+        """Solve a block and correct it; intervals that failed are flagged in what comes back."""
+        model = self.run.model
+        assert model is not None
+        with self.run.timed("solve"):
+            solution = self.solver.solve(block, model)
+        corrected = block.corrected(solution.term)
+        # solutions and sums are all that stays of a block: masks, data and models of a long run are GB
+        self.parts.append(replace(solution, suspects=np.zeros((1, 1, 1), bool)))
+        if self._rms:
+            with self.run.timed("errors"):
+                self.errors = self.errors or DISums(block.antenna1, block.antenna2)
+                truth = solution.truth(Chain(*self.run.instrument.receivers()), block.at)
+                self.errors.add(truth, solution)
+        made = (lambda: block, lambda: corrected, lambda: block - corrected, lambda: corrected - model)
+        with self.run.timed("images"):
+            for name, make in zip(IMAGES, made, strict=True):
+                part = make()
+                self.power[name] = self.power.get(name, 0.0) + float((np.abs(part.data) ** 2).sum())
+                if self.images:
+                    self.images[name].add(part.flagged(corrected.flag))
+        self.power["model"] = self.power.get("model", 0.0) + float((np.abs(model.data) ** 2).sum())
+        return corrected
+
+    def finish(self) -> CalibrationResult:
+        """Everything that the stage found."""
+        solution = Solution.joined(self.parts)
+        errors = self.errors.finish(self._rms) if self.errors else None
+        with self.run.timed("images"):
+            cubes = {name: images.finish() for name, images in self.images.items()}
+        image = self.run.stage("image", Image)
+        uv_range = None if image is None else image.imager.uv_range
+        rms = {k: float(np.sqrt(v)) for k, v in self.power.items()}
+        return CalibrationResult(solution, errors, cubes, rms, uv_range)
+
+
+@dataclass(frozen=True)
+class CalibrationResult(StageResult):
+    """Solutions of a run, how they compare with the truth, images of what they leave, and rms of visibilities."""
+
+    solution: Solution
+    errors: DIComparison | None
+    cubes: dict[str, StokesCube]
+    rms: dict[str, float]
+    uv_range: tuple[float, float] | None = None  # of the images
+
+    @property
+    def passed(self) -> bool:
+        """Whether every interval converged."""
+        return bool(self.solution.converged.all())
+
+    def record(self) -> dict[str, Any]:
+        """Outcomes, and what is left, under "calibration"."""
+        check = {"outcome": [o.value for o in set(self.solution.outcome.ravel())], "passed": self.passed}
+        return {"checks": {"calibration": check}, "calibration": self.figures()}
+
+    def figures(self) -> dict[str, Any]:
+        """Outcomes, iterations, errors in % of the rms put in, and shares of the rms that are left."""
+        out: dict[str, Any] = {
+            "summary": str(self.solution),
+            "outcomes": {o.name.lower(): int((self.solution.outcome == o).sum()) for o in Outcome},
+            "passed": self.passed,
+            "iterations_median": float(np.median(self.solution.iterations)),
+            "visibility_rms_share": {k: self.rms[k] / self.rms["model"] for k in IMAGES if self.rms["model"]},
+        }
+        if self.errors is not None:
+            out["di_errors_percent"] = {"linear": self.errors.linear, "quadratic": self.errors.quadratic}
+        if self.cubes:
+            whole = np.nanstd(self.cubes["corrected"].data[0, 0])
+            out["image_rms_share"] = {k: float(np.nanstd(c.data[0, 0]) / whole) for k, c in self.cubes.items()}
+        return out
+
+    def spectra(self) -> dict[str, Any]:
+        """2D power spectra of the images, Stokes I and Q + iU, by name."""
+        stokes: tuple[Literal["I", "P"], ...] = ("I", "P")
+        return {
+            f"{name}, {s}": Analyzer(self.cubes[name]).spectrum_2d(s, uv_range=self.uv_range, taper="hann")
+            for name in IMAGES[1:]
+            for s in stokes
+        }
+
+    def sections(self, draw: Draw) -> list[Section]:
+        """Errors of the solutions, gains against time, how it converged, and what is left."""
+        from instrument.report.calibration import convergence, gains, residuals
+        from instrument.report.spectra import spectra_2d
+
+        solution = self.solution
+        blocks: list[Block] = [Text(str(solution))]
+        if self.errors is not None:
+            text = "The seven direction-independent error parameters, in % of the rms put in."
+            blocks.append(Table.of(self.errors.table(), text))
+        entries = [
+            draw("gains", gains(solution), "Solved gains of every station against time; white: no solution."),
+            draw("convergence", convergence(solution), "How the solve converged: the slowest interval."),
+            draw("residual", residuals(solution), "What the solutions leave of the data they were solved from."),
+        ]
+        if self.cubes:
+            text = "2D power spectra of what calibration leaves in the images, Hann taper; the PSF stays."
+            entries.append(draw("calibration_spectra", spectra_2d(self.spectra()), text))
+        return [Section("Calibration", [*blocks, Figures(entries)])]
+
+    def write(self, folder: Path) -> None:
+        """solutions.h5 (h5parm) and di_errors.ecsv."""
+        write_h5parm(folder / "solutions.h5", self.solution)
+        if self.errors is not None:
+            write_ecsv(self.errors.table(), folder / "di_errors.ecsv")
+
+    def lines(self) -> list[str]:
+        """Lines for the terminal."""
+        lines = ["", f"calibration   {self.solution}"]
+        share = self.figures().get("image_rms_share", {})
+        for name in IMAGES[2:]:
+            text = f"{100 * self.rms[name] / self.rms['model']:.2g} % of the visibility rms"
+            text += f", {100 * share[name]:.2g} % of the image rms" if name in share else ""
+            lines.append(f"{name:<24} {text}")
+        if self.errors is not None:
+            names = list(self.errors.linear["input"])
+            lines.append("DI errors, % of rms      " + " ".join(f"{n.upper():>9}" for n in names))
+            for kind, part in (("linear", self.errors.linear), ("quadratic", self.errors.quadratic)):
+                for which, values in part.items():
+                    lines.append(f"{kind + ', ' + which:<34}" + " ".join(f"{values[n]:9.2g}" for n in names))
+        return lines

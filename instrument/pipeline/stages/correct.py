@@ -1,0 +1,39 @@
+"""The table [correct]: the beam towards the phase centre taken out of the visibilities."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from instrument.errors import unused
+from instrument.pipeline.stage import Running, Stage, StageRun
+from instrument.scene import Scene
+from instrument.visibilities import Visibilities
+
+
+class Correct(Stage):
+    """Takes effects out of the visibilities: `beam = "centre"` the beam towards the phase centre."""
+
+    after: ClassVar[tuple[str, ...]] = ("noise", "calibrate")
+    beam: Literal["centre"] = "centre"
+
+    def ranges(self) -> tuple[tuple[float, float] | None, ...]:
+        """None: what others ask for is corrected."""
+        return ()
+
+    def check(self, scene: Scene) -> None:
+        """Name the table where there is no beam."""
+        if not scene.instrument.chain().beams().parts:
+            unused("scene", ["[correct]"], "the instrument has no beam to take out")
+
+    def start(self, run: Running) -> StageRun:
+        """The stage at work."""
+        return _CorrectRun(run)
+
+
+class _CorrectRun(StageRun):
+    def __init__(self, run: Running) -> None:
+        self.run = run
+
+    def take(self, block: Visibilities) -> Visibilities:
+        """The block without the beam towards its centre."""
+        return block.without_beam(self.run.instrument)

@@ -1,0 +1,107 @@
+"""The table [image]: images of what comes by, and their PSF."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from instrument.errors import unused
+from instrument.image.cube import StokesCube
+from instrument.image.dirty import Imager, Images
+from instrument.memory import afford
+from instrument.pipeline.stage import Beside, Draw, Running, Stage, StageResult, StageRun
+from instrument.report.page import Card, Figures, Section, Table, number
+from instrument.scene import Scene
+from instrument.visibilities import Visibilities
+
+
+class Image(Stage):
+    """Images by an `imager`, whose settings are those of the table."""
+
+    after: ClassVar[tuple[str, ...]] = ("noise", "calibrate", "correct")
+    imager: Imager
+
+    @classmethod
+    def from_table(cls, settings: Mapping[str, Any], beside: Beside) -> Self:
+        """The stage; the settings are those of the imager."""
+        return cls(imager=Imager(**settings))
+
+    def ranges(self) -> tuple[tuple[float, float] | None, ...]:
+        """That of the imager."""
+        return (self.imager.uv_range,)
+
+    def check(self, scene: Scene) -> None:
+        """Refuse images that do not fit into memory; name a robust that no weighting takes."""
+        channels, pixels = scene.observation.freq_hz.size, self.imager.pixels
+        what = f"image.pixels = {pixels}: images of {channels} channels"
+        # 5 planes of sums, 4 of the cube, and 3 of one that is being gridded or transformed
+        afford(8.0 * 12 * channels * pixels**2, what, "lower image.pixels, or the number of channels")
+        if self.imager.weighting != "briggs" and "robust" in self.imager.model_fields_set:
+            unused("[image]", ["robust"], f"it is of weighting = 'briggs', and this is '{self.imager.weighting}'")
+
+    def start(self, run: Running) -> StageRun:
+        """The stage at work."""
+        return _ImageRun(self.imager, self.sums(run))
+
+    def sums(self, run: Running) -> Images:
+        """Empty sums of images, with the weights of this run."""
+        return self.imager.start(run.density(self.imager))
+
+
+class _ImageRun(StageRun):
+    def __init__(self, imager: Imager, images: Images) -> None:
+        self.imager, self.images = imager, images
+
+    def take(self, block: Visibilities) -> Visibilities:
+        """Add a block to the images."""
+        self.images.add(block)
+        return block
+
+    def finish(self) -> StageResult:
+        """The cube."""
+        return ImageResult(self.imager, self.images.finish())
+
+
+@dataclass(frozen=True)
+class ImageResult(StageResult):
+    """Images of a run: a cube with its PSF."""
+
+    imager: Imager
+    cube: StokesCube
+
+    def record(self) -> dict[str, Any]:
+        """Unit, PSF and rms of the first channel."""
+        psf = self.cube.psf
+        assert psf is not None
+        return {
+            "stage_errors": {"image": f"gridding {self.imager.accuracy:.0e} of the image rms asked for"},
+            "image": {
+                "unit": self.cube.unit,
+                "psf_arcmin": [round(float(np.rad2deg(x[0]) * 60), 3) for x in (psf.major_rad, psf.minor_rad)],
+                "rms": {s: float(np.nanstd(self.cube.data[0, k])) for k, s in enumerate("IQUV")},
+            },
+        }
+
+    def write(self, folder: Path) -> None:
+        """cube.fits."""
+        self.cube.write(folder / "cube.fits")
+
+    def cards(self) -> list[Card]:
+        """The PSF."""
+        major, minor = (number(width) for width in self.record()["image"]["psf_arcmin"])
+        return [Card("PSF", f"{major}′ × {minor}′", "width at half maximum")]
+
+    def sections(self, draw: Draw) -> list[Section]:
+        """Images of the first channel, the PSF, and the rms of each Stokes parameter."""
+        from instrument.report.images import psf_image, stokes_images
+
+        entries = [draw("images", stokes_images(self.cube), "Dirty images of the four Stokes parameters.", wide=True)]
+        if self.cube.psf is not None and self.cube.psf.data is not None:
+            text = "Point spread function and the Gaussian fitted to its main lobe."
+            entries.append(draw("psf", psf_image(self.cube), text))
+        rms = [[stokes, number(value)] for stokes, value in self.record()["image"]["rms"].items()]
+        return [Section("Images", [Figures(entries), Table(["Stokes", f"rms ({self.cube.unit})"], rms)])]

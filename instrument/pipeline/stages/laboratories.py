@@ -1,0 +1,152 @@
+"""The laboratories of the table [calibrate], kind = "incomplete-model" and "many-directions"."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+from instrument.analyze.laboratory import IncompleteModel
+from instrument.analyze.many_directions import ManyDirections
+from instrument.analyze.subtraction import ManyDirectionsResult
+from instrument.analyze.sweep import Sweep
+from instrument.calibrate.directional import DirectionalCal
+from instrument.image.dirty import Imager
+from instrument.pipeline.stage import Beside, Draw, Running, Stage, StageResult, StageRun
+from instrument.pipeline.stages.noise import STEP, Noise
+from instrument.report.page import Figures, Section, Table, Text
+from instrument.visibilities import Visibilities
+
+
+def _common(beside: Beside) -> dict[str, Any]:
+    """Seed and noise of a laboratory: those of the scene."""
+    common: dict[str, Any] = {"seed": beside.seed_of(STEP)}
+    if "noise" in beside.tables:
+        common["sefd"] = f"{Noise.from_table(beside.tables['noise'], beside).sefd!r} Jy"
+    return common
+
+
+class IncompleteModelStage(Stage):
+    """Calibrates on the n brightest sources, for every n asked for; settings are those of `IncompleteModel`."""
+
+    alone: ClassVar[tuple[str, ...] | None] = ("noise", "image")
+    laboratory: IncompleteModel
+
+    @classmethod
+    def from_table(cls, settings: Mapping[str, Any], beside: Beside) -> Self:
+        """The stage, with the noise and the images of the scene."""
+        image = {"image": Imager(**beside.tables["image"])} if "image" in beside.tables else {}
+        return cls(laboratory=IncompleteModel(**{**image, **_common(beside), **settings}))
+
+    def start(self, run: Running) -> StageRun:
+        """The stage at work."""
+        return _Alone(run, lambda progress: SweepResult(self.laboratory.run(run.plan, progress=progress)))
+
+
+class ManyDirectionsStage(Stage):
+    """Solves for clusters of sources at once; settings are those of `ManyDirections` and of its `DirectionalCal`."""
+
+    alone: ClassVar[tuple[str, ...] | None] = ("noise",)
+    laboratory: ManyDirections
+
+    @classmethod
+    def from_table(cls, settings: Mapping[str, Any], beside: Beside) -> Self:
+        """The stage, with the noise of the scene."""
+        own = dict(settings)
+        solver = {key: own.pop(key) for key in DirectionalCal.model_fields if key in own}
+        if solver:
+            own["calibrator"] = DirectionalCal(**solver)
+        return cls(laboratory=ManyDirections(**{**_common(beside), **own}))
+
+    def start(self, run: Running) -> StageRun:
+        """The stage at work."""
+        return _Alone(run, lambda progress: SubtractionResult(self.laboratory.run(run.plan, progress=progress)))
+
+
+class _Alone(StageRun):
+    """A laboratory at work: it predicts its own blocks, and gives none on."""
+
+    def __init__(self, run: Running, work: Callable[[Callable[[float], None]], StageResult]) -> None:
+        self.run, self.work = run, work
+        self.result: StageResult | None = None
+
+    def blocks(self, progress: Callable[[float], None]) -> Iterator[Visibilities]:
+        """None: everything is done here."""
+        self.result = self.work(progress)
+        yield from ()
+
+    def finish(self) -> StageResult:
+        """What the laboratory found."""
+        assert self.result is not None
+        return self.result
+
+
+@dataclass(frozen=True)
+class SweepResult(StageResult):
+    """What calibrating on incomplete models did."""
+
+    sweep: Sweep
+
+    @property
+    def passed(self) -> bool:
+        """Whether every solve converged."""
+        return self.sweep.passed
+
+    def record(self) -> dict[str, Any]:
+        """Whether every solve converged."""
+        return {"checks": {"solutions": {"outcome": [], "passed": self.passed}}}
+
+    def lines(self) -> list[str]:
+        """One line a model."""
+        return ["", *self.sweep.lines()]
+
+    def write(self, folder: Path) -> None:
+        """Tables and images."""
+        self.sweep.write(folder)
+
+    def sections(self, draw: Draw) -> list[Section]:
+        """Errors against the size of the model."""
+        from instrument.report.laboratory import errors_against_model
+        from instrument.report.spectra import spectra_2d
+
+        text = "Errors against the number of sources in the model."
+        entries = [draw("errors_against_model", errors_against_model(self.sweep), text)]
+        if self.sweep.reference is not None:
+            made = self.sweep.spectra(taper="hann").items()
+            curves = {f"left with {n} in the model" if n else "true image": curve for n, curve in made}
+            text = "2D power spectra of the images, Hann taper; the PSF stays."
+            entries.append(draw("spectrum_2d", spectra_2d(curves), text))
+        rows = Table.of(self.sweep.table(), "One row a model of the n brightest sources.")
+        return [Section("Incomplete models", [Figures(entries), rows])]
+
+
+@dataclass(frozen=True)
+class SubtractionResult(StageResult):
+    """What solving for many directions at once left."""
+
+    found: ManyDirectionsResult
+
+    @property
+    def passed(self) -> bool:
+        """Whether every solve converged."""
+        return self.found.passed
+
+    def record(self) -> dict[str, Any]:
+        """Whether every solve converged."""
+        return {"checks": {"solutions": {"outcome": [], "passed": self.passed}}}
+
+    def lines(self) -> list[str]:
+        """One line a cluster, and what is left."""
+        return ["", *self.found.lines()]
+
+    def write(self, folder: Path) -> None:
+        """The table."""
+        self.found.write(folder)
+
+    def sections(self, draw: Draw) -> list[Section]:
+        """The table of clusters, and what is left in words."""
+        rows = Table.of(
+            self.found.table(), "Rms of visibilities; one: with one direction for all. Errors without the gauge."
+        )
+        return [Section("Many directions", [Text("\n".join(self.found.lines()), code=True), rows])]

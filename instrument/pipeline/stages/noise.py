@@ -1,0 +1,48 @@
+"""The table [noise]: thermal noise of stations of one `sefd`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Self
+
+from pydantic import Field
+
+from instrument.errors import InputError
+from instrument.pipeline.stage import Beside, Running, Stage, StageRun
+from instrument.units import Jansky, Seed
+from instrument.visibilities import Visibilities
+
+STEP = 3  # of the seeds of a scene
+
+
+class Noise(Stage):
+    """Thermal noise of stations whose system equivalent flux density is `sefd`, independent in every visibility."""
+
+    sefd: Annotated[Jansky, Field(gt=0)]
+    seed: Seed
+
+    @classmethod
+    def from_table(cls, settings: Mapping[str, Any], beside: Beside) -> Self:
+        """The stage, its seed that of the scene."""
+        if beside.width_hz is None:
+            raise InputError("needs the width of a channel: give channel_width in [observation]")
+        return cls(**{"seed": beside.seed_of(STEP), **settings})
+
+    def ranges(self) -> tuple[tuple[float, float] | None, ...]:
+        """None: noise is added to what others ask for."""
+        return ()
+
+    def start(self, run: Running) -> StageRun:
+        """The stage at work."""
+        return _NoiseRun(self)
+
+
+class _NoiseRun(StageRun):
+    def __init__(self, settings: Noise) -> None:
+        self.settings = settings
+
+    def take(self, block: Visibilities) -> Visibilities:
+        """The block with noise."""
+        from astropy import units as u
+
+        return block.with_noise(self.settings.sefd * u.Jy, seed=self.settings.seed)
