@@ -226,12 +226,7 @@ RECORD = {
         "prediction": {"error": 3e-14, "bound": 2e-12, "samples": 64, "relative_to_jy": 189.6, "passed": True},
         "photometry": {"outcome": ["converged"], "passed": True, "flux_in_jy": 189.6, "flux_out_jy": 116.3},
     },
-    "leakage": {
-        "inside_4_deg": leakage_on_grid().inside(4.0),
-        "rings": leakage_on_grid().rings(),
-        "near_null": 2,
-    },
-    "image": {"unit": "Jy/beam", "psf_arcmin": [3.83, 3.81], "rms": {"I": 0.61, "Q": 4.6e-5}},
+    "parts": {"image": {"weights": 2.0}},
     "command": "instrument run mock-grid --set seed=196",
 }
 
@@ -240,8 +235,13 @@ RECORD = {
 def page(tmp_path):
     drawing = style.save(figures.profile(leakage_on_grid()), tmp_path / "profile.png")
     entry = FigureEntry(drawing, "Leakage <against> distance", wide=True)
-    more = [Section("Spectra", [Text("a paragraph"), Table(["k"], [[1.5]])])]
-    path = write_page(page_of_run(RECORD, [entry], leakage_on_grid().table(), more), tmp_path / "report.html")
+    sections = [
+        Section("Leakage", [Figures([entry])]),
+        Section("Spectra", [Text("a paragraph"), Table(["k"], [[1.5]])]),
+    ]
+    sources = [Section("All sources", [Details("25 sources", [Table.of(leakage_on_grid().table())])])]
+    made = page_of_run(RECORD, [Card("PSF", "3.83′ × 3.81′")], sections, sources)
+    path = write_page(made, tmp_path / "report.html")
     assert not list(tmp_path.glob("*.part"))
     return path.read_text(encoding="utf-8")
 
@@ -251,7 +251,7 @@ def test_the_page_holds_what_was_given(page):
     for part in (
         "A <b>grid</b> & more", "scene mock-grid: <59> stations", "Leakage <against> distance", "a paragraph", "1.50",
         "Done; every check held", "3.0e-14", "bound 2.0e-12", "189.6 Jy", "116.3 Jy", "30 s", "3.83′ × 3.81′", "9.8.7",
-        "engine matrix, 16 workers", "instrument run mock-grid --set seed=196", "25 sources", "s17", "converged",
+        "engine matrix, 16 workers", "instrument run mock-grid --set seed=196", "25 sources", "s17", "converged", "weights",
     ):  # fmt: skip
         assert part in text, part
     assert "width:100.0%" in page and "width:50.0%" in page and "width:0.0%" in page
