@@ -11,7 +11,9 @@ from astropy import units as u
 import instrument
 from instrument import DirectionalCal, FeedTerm, GainTerm, Observation, Scene, SelfCal
 from instrument.calibrate.base import Solution
-from instrument.calibration_run import CalibrationStage
+from instrument.jones.chain import Chain
+from instrument.pipeline.stage import Running
+from instrument.pipeline.stages.calibrate import _CalibrateRun
 
 BLOCK, STATIONS = 5, 16
 SOLUTION = 64 * STATIONS  # bytes an integration; its data are 64 x 120 baselines = 7.5 times as much
@@ -64,17 +66,18 @@ def bytes_per_integration(work):
 @pytest.mark.parametrize("spoilt", [False, True])
 def test_i13_a_run_grows_by_its_solutions(scene, spoilt):
     model = scene.with_fields(instrument=scene.instrument.with_fields(gain=None, feed=None)).plan().run()
-    stage = CalibrationStage(SelfCal(), scene.instrument, {})
-    data = stage.corrupt(model)
+    data = model.corrupted(Chain(*scene.instrument.receivers()))
     if spoilt:  # marks of visibilities that stand out are as large as flags
         data.data[:, :, 7] *= 1e3
     solver = Again(SelfCal(tolerance=1e-6, iterations=20), data, model)
     assert solver.first.suspects.any() == spoilt
 
     def work(blocks):
-        stage = CalibrationStage(solver, scene.instrument, {})
+        run = Running("x", 0, scene.instrument, scene.plan(), {})
+        stage = _CalibrateRun(solver, run, {})
         for k in range(blocks):
-            stage.correct(later(data, k), later(model, k))
+            run.model = later(model, k)
+            stage.take(later(data, k))
         found = stage.finish()
         assert len(found.solution.outcome) == blocks * BLOCK
         assert bool(found.solution.spoilt) == spoilt

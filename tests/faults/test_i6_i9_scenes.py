@@ -129,7 +129,7 @@ def test_i9_g9_what_cannot_be_is_refused_by_the_plan(settings, words, planned):
         (["instrument.beam='none'", "correct={}"], "scene: not used: [correct] (the instrument has no beam"),
         (
             ["calibrate={kind='many-directions',clusters=2}", "correct={}", "analyze={products=[]}"],
-            "scene: not used: [correct], [analyze], [image] (a laboratory",
+            "scene: not used: [image], [correct], [analyze] (a laboratory",
         ),
         (
             ["calibrate={kind='incomplete-model',models=[1]}", "analyze={products=[]}"],

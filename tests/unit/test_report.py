@@ -251,7 +251,8 @@ def test_the_page_holds_what_was_given(page):
     for part in (
         "A <b>grid</b> & more", "scene mock-grid: <59> stations", "Leakage <against> distance", "a paragraph", "1.50",
         "Done; every check held", "3.0e-14", "bound 2.0e-12", "189.6 Jy", "116.3 Jy", "30 s", "3.83′ × 3.81′", "9.8.7",
-        "engine matrix, 16 workers", "instrument run mock-grid --set seed=196", "25 sources", "s17", "converged", "weights",
+        "engine matrix, 16 workers", "instrument run mock-grid --set seed=196", "25 sources", "s17", "converged",
+        "weights",
     ):  # fmt: skip
         assert part in text, part
     assert "width:100.0%" in page and "width:50.0%" in page and "width:0.0%" in page
