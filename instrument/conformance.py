@@ -3,7 +3,7 @@
 `check(obj)` returns a `Report`, one line per claim. A claim is a function whose name is the sentence it checks: it
 returns a remark (what was measured) and raises when it does not hold. The claims of Jones terms are in
 `conformance_terms`, those of engines in `conformance_engines`, those of foreground removers in
-`conformance_foregrounds`; what they are evaluated on is in `conformance_bench`.
+`conformance_foregrounds`, those of stages in `conformance_stages`; what they are tried on is in `conformance_bench`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from instrument import conformance_engines, conformance_foregrounds, conformance_terms, mat2
+from instrument import conformance_engines, conformance_foregrounds, conformance_stages, conformance_terms, mat2
 from instrument.component import Component
 from instrument.conformance_bench import (
     Broken,
@@ -35,6 +35,7 @@ from instrument.jones.feed import FeedTerm
 from instrument.jones.gain import GainTerm
 from instrument.model import Instrument
 from instrument.observe.sampling import Sampling
+from instrument.pipeline.stage import Stage
 from instrument.predict.base import Predictor
 from instrument.sky.base import Sky
 
@@ -77,7 +78,7 @@ class Report:
 
 
 def check(obj: object, at: Sampling | None = None) -> Report:
-    """Check a Jones term, an instrument, a sky, an engine or a foreground remover against the contract of its kind.
+    """Check a Jones term, an instrument, a sky, an engine, a remover or a stage against the contract of its kind.
 
     `at` is where a term is evaluated and where a sky is placed, for those that fit one array only (tables per station);
     a small array of LOFAR-like stations otherwise. Raises `InputError` where there is no contract for such an object.
@@ -303,10 +304,17 @@ def _remover(remover: ForegroundRemover, at: Sampling | None) -> Iterator[Line]:
         yield _line(claim, remover)
 
 
+def _stage(stage: Stage, at: Sampling | None) -> Iterator[Line]:
+    yield _line(a_round_trip_through_json_gives_an_equal_object, stage, Stage)
+    for claim in conformance_stages.CLAIMS:
+        yield _line(claim, stage)
+
+
 CONTRACTS: dict[type[Component], Callable[[Any, Sampling | None], Iterator[Line]]] = {
     JonesTerm: _term,
     Instrument: _instrument,
     Sky: _sky,
     Predictor: _engine,
     ForegroundRemover: _remover,
+    Stage: _stage,
 }

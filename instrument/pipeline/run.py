@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from instrument.pipeline.scene_file import SceneFile
 from instrument.pipeline.scene_text import to_toml
 from instrument.pipeline.stage import Running, StageRun
 from instrument.pipeline.stages.receivers import NAME, Receivers
+from instrument.visibilities import Visibilities
 
 PREDICT = "predict"
 
@@ -72,38 +73,45 @@ def _compute(result: Result) -> None:
     """Stream the blocks through the stages that the scene has."""
     stages = result.scene.running
     run = Running(result.scene.name, result.scene.seed, result.instrument, result.plan, stages, parts=result.parts)
-    work: dict[str, StageRun] = {}
-    if any(stage.perfect for stage in stages.values()):
-        work[NAME] = Receivers(result.instrument)
-    for name, stage in stages.items():
-        with _at_work(result, run, name):
-            work[name] = stage.start(run)
-    alone = result.scene.alone
-    named = ", ".join([PREDICT, *work] if alone is None else [alone])
+    named = ", ".join([PREDICT, *stages] if result.scene.alone is None else stages)
     with progress_bar(f"{result.scene.name}: {named}") as update:
-        others, begin = sum(result.seconds.values()), time.perf_counter()
-        blocks = result.plan.blocks(progress=update) if alone is None else work[alone].blocks(update)
-        for block in blocks:
-            run.model = block
-            for name, one in work.items():
-                with _at_work(result, run, name):
-                    block = one.take(block)
-        spent = time.perf_counter() - begin - (sum(result.seconds.values()) - others)
-        source = alone or PREDICT
-        result.seconds[source] = result.seconds.get(source, 0.0) + spent
-    run.model = None
-    for name, one in work.items():
-        with _at_work(result, run, name):
-            run.results[name] = one.finish()
+        stream(run, result.timed, update)
     result.stages = run.results
 
 
-@contextmanager
-def _at_work(result: Result, run: Running, name: str) -> Iterator[None]:
-    """Time what a stage does as its own."""
-    run.now = name
-    with result.timed(name):
-        yield
+def stream(
+    run: Running,
+    timed: Callable[[str], AbstractContextManager[None]] = lambda name: nullcontext(),
+    progress: Callable[[float], None] = lambda done: None,
+) -> None:
+    """Let the blocks of a plan go through stages one by one and fill in their results; `timed` clocks each stage."""
+
+    def at_work(name: str) -> AbstractContextManager[None]:
+        run.now = name
+        return timed(name)
+
+    work: dict[str, StageRun] = {}
+    if any(stage.perfect for stage in run.stages.values()):
+        work[NAME] = Receivers(run.instrument)
+    for name, stage in run.stages.items():
+        with at_work(name):
+            work[name] = stage.start(run)
+    alone = next((name for name, stage in run.stages.items() if stage.alone is not None), None)
+    blocks = run.plan.blocks(progress=progress) if alone is None else work[alone].blocks(progress)
+    end = object()
+    while True:
+        with at_work(alone or PREDICT):
+            block = next(blocks, end)
+        if not isinstance(block, Visibilities):
+            break
+        run.model = block
+        for name, one in work.items():
+            with at_work(name):
+                block = one.take(block)
+    run.model = None
+    for name, one in work.items():
+        with at_work(name):
+            run.results[name] = one.finish()
 
 
 def _write(result: Result, tables: dict[str, Any], folder: Path) -> None:

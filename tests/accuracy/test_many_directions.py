@@ -135,12 +135,12 @@ def test_what_does_not_fit_the_sky_is_refused_in_one_line(settings, words):
 def test_wrong_settings_of_a_scene_are_refused_in_one_line(wrong):
     tables = override(read_tables("many-directions"), [f"calibrate.{wrong}"])
     with pytest.raises(InputError) as error:
-        parse(tables).laboratory()
+        parse(tables)
     assert str(error.value).startswith("[calibrate]") and "\n" not in str(error.value)
 
 
 def test_the_scene_says_what_it_solves():
-    found = parse(read_tables("many-directions")).laboratory()
+    found = parse(read_tables("many-directions")).stages["calibrate"].laboratory
     assert isinstance(found, ManyDirections)
     assert found.clusters == 5 and found.sefd == 2820 and found.calibrator.interval == 60
     assert ManyDirections.from_json(found.to_json()) == found

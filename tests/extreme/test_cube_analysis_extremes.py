@@ -74,7 +74,7 @@ def test_channels_that_are_missing_leave_the_rest():
 def test_i_without_data_at_the_brightest_pixel_of_q_and_u():
     given = spoilt(cube("IQU"), slice(None), slice(1, 3), 5, 7, value=9.0)
     found = made(spoilt(given, slice(None), 0, 5, 7), products=("faraday",))
-    assert found.brightest == (5, 7) and "I" not in found.lines and "P" in found.lines
+    assert found.brightest == (5, 7) and "I" not in found.sights and "P" in found.sights
 
 
 def test_a_beam_is_asked_for_where_there_is_data_only():

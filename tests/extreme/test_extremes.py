@@ -947,7 +947,7 @@ def test_nested_parents_are_made_and_a_second_run_takes_the_next_name(tiny):
 
 
 def test_an_interrupted_run_leaves_nothing_behind(tiny, monkeypatch, capsys):
-    from instrument import run
+    from instrument.pipeline import run
 
     def stop(*args):
         raise KeyboardInterrupt
@@ -960,7 +960,7 @@ def test_an_interrupted_run_leaves_nothing_behind(tiny, monkeypatch, capsys):
 
 def test_two_runs_of_one_name_at_a_time_do_not_share_a_folder(tiny, monkeypatch):
     """The second begins while the first computes: the folder of the first must not be taken from under it."""
-    from instrument import run
+    from instrument.pipeline import run
 
     inner, started = run._compute, []
 

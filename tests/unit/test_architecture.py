@@ -45,7 +45,14 @@ LAYERS = (
     ("files",),
     ("report",),
     ("pipeline",),
-    ("conformance", "conformance_bench", "conformance_terms", "conformance_engines", "conformance_foregrounds"),
+    (
+        "conformance",
+        "conformance_bench",
+        "conformance_terms",
+        "conformance_engines",
+        "conformance_foregrounds",
+        "conformance_stages",
+    ),
     ("doctor",),
     ("",),  # `instrument` itself, which looks names up in all of them when they are first used
     ("cli",),
