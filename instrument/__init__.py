@@ -78,6 +78,9 @@ _HOME = {
     "Signal21cm": "analyze.signal",
     "EoRWindow": "analyze.window",
     "CubeAnalysis": "pipeline.stages.cube",
+    "Stage": "pipeline.stage",
+    "StageRun": "pipeline.stage",
+    "StageResult": "pipeline.stage",
 }
 _MODULES = ("conformance", "ixr", "mueller", "units")
 __all__ = [*_HOME, *_MODULES, "__version__"]

@@ -171,8 +171,9 @@ class SceneFile(Component):
             uv_range=self.products_uv_range(),
         )
         absent = [name for name in top_level() if name not in self.stages]
-        items = (Item(", ".join(absent), "absent from the scene"),) if absent else ()
-        return replace(found, left_out=found.left_out + items)
+        kept = (Item("stages", f"{', '.join(self.running)}, in this order"),) if self.running else ()
+        left_out = (Item(", ".join(absent), "absent from the scene"),) if absent else ()
+        return replace(found, kept=found.kept + kept, left_out=found.left_out + left_out)
 
     def _say_unused(self) -> None:
         """Name tables and keys that nothing will take."""

@@ -23,6 +23,7 @@ from instrument import (
     StationBeam,
     Towards,
 )
+from instrument.analyze.many_directions import ManyDirections
 from instrument.component import Component
 from instrument.conformance import Report, check
 from instrument.conformance_bench import bench, hard_places, lofar_like, random_sky
@@ -37,7 +38,7 @@ from instrument.predict.base import Work
 from instrument.predict.direct import Direct
 from instrument.registry import KINDS, available, load
 
-SETTINGS: dict[tuple[str, str], list[dict[str, Any]]] = {
+SETTINGS: dict[tuple[str, ...], list[dict[str, Any]]] = {
     ("elements", "airy"): [{"diameter": 25 * u.m}],
     ("elements", "dipole"): [{"height": 0.5 * u.m, "x_azimuth": 30 * u.deg}],
     ("elements", "gaussian"): [{"fwhm": 4 * u.deg}, {"fwhm": 4 * u.deg, "frequency": 150 * u.MHz}],
@@ -50,11 +51,20 @@ SETTINGS: dict[tuple[str, str], list[dict[str, Any]]] = {
         {"beam": None, "gain": GainTerm(rms=0.1)},
     ],
     ("telescopes", "lofar-lba"): [{}, {"antennas": "inner"}],
-    ("foregrounds", "gmca"): [{}, {"mode": "threshold"}, {"paper": True, "stokes": "Q"}, {"noise": "white"}],
+    ("foregrounds", "gmca"): [{}, {"paper": True, "stokes": "Q"}],
+    ("foregrounds", "gmca", "long"): [{"mode": "threshold"}, {"noise": "white"}],
     ("foregrounds", "pca"): [{}, {"components": 0}, {"stokes": "V"}],
     ("foregrounds", "polynomial"): [{}, {"terms": 1}],
     ("foregrounds", "faraday-filter"): [{}, {"depth": 5 * u.rad / u.m**2}],
     ("skies", "grid"): [{}, {"shape": (4, 3), "polarization": (0.1, 0.2, 0.05), "spectral_index": -0.7}],
+    ("stages", "noise"): [{"sefd": 100 * u.Jy, "seed": 1}],
+    ("stages", "calibrate"): [{"calibrator": instrument.SelfCal(tolerance=1e-8)}],
+    ("stages", "calibrate.incomplete-model"): [{"laboratory": instrument.IncompleteModel(models=(1, 3))}],
+    ("stages", "calibrate.many-directions"): [
+        {"laboratory": ManyDirections(clusters=2, calibrator=instrument.DirectionalCal(tolerance=1e-6))}
+    ],
+    ("stages", "image"): [{"imager": instrument.Imager(pixels=32, pixel=10 * u.arcmin)}],
+    ("stages", "analyze"): [{}, {"products": ("leakage", "spectrum-2d")}],
     ("skies", "random"): [{"polarization": 0.3, "circular": 0.1, "scatter": 0.2, "seed": 5}],
     ("skies", "mock-3c196"): [{"components": True, "scatter": 0.1}],
     ("skies", "catalogue"): [{"path": "3c196_pandey.skymodel"}, {"path": "mock_150mhz.csv", "brightest": 50}],
@@ -75,6 +85,13 @@ def test_every_registered_plugin_keeps_its_contract(kind, name, settings):
         names = found.layout().names
         found = load(kind, name, **settings, stations=[*names[:3], names[-1]])
     report = check(found)
+    assert report.passed, str(report)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("settings", SETTINGS["foregrounds", "gmca", "long"])
+def test_the_other_ways_of_gmca_keep_their_contract(settings):
+    report = check(load("foregrounds", "gmca", **settings))
     assert report.passed, str(report)
 
 

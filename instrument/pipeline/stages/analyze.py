@@ -83,10 +83,9 @@ class _AnalyzeRun(StageRun):
 
     def _spectra(self) -> SpectraResult:
         images = self._images()
-        uv_range = images.imager.uv_range
+        analyzer, uv_range = Analyzer(images.cube), images.imager.uv_range
         with self.run.timed("2D spectra"):
-            made = {s: Analyzer(images.cube).spectrum_2d(stokes=s, uv_range=uv_range, taper="hann") for s in STOKES}
-        return SpectraResult(made)
+            return SpectraResult({s: analyzer.spectrum_2d(s, uv_range=uv_range, taper="hann") for s in STOKES})
 
 
 @dataclass(frozen=True)

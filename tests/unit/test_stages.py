@@ -1,0 +1,127 @@
+"""Stages: one table of a scene file each, in declared order, ours and a stranger's by the same door."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.table import QTable
+
+from instrument import InputError, Stage
+from instrument.analyze.photometry import ForcedPhotometry
+from instrument.pipeline.run import run
+from instrument.pipeline.scene_file import parse
+from instrument.pipeline.scene_text import override, read_tables
+from instrument.pipeline.stage import in_order
+
+PAGE = Path(__file__).parents[2] / "docs" / "extending.md"
+SMALL = [
+    "instrument.stations=['CS001HBA0', 'CS003HBA1', 'CS302HBA1', 'RS106HBA']",
+    "observation.duration='40 min'", "observation.interval='10 min'", "sky.shape=[3, 3]", "image.pixels=64",
+]  # fmt: skip
+
+
+def small(*settings):
+    return override(read_tables("mock-grid"), [*SMALL, *settings])
+
+
+@pytest.fixture
+def strangers(tmp_path):
+    """A package of somebody else, made of the page on extending, as it lies after its installation."""
+    block = next(b for b in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.S) if "class Flagged" in b)
+    head = "from typing import Annotated\nimport numpy as np\nfrom pydantic import Field\n"
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "my_package.py").write_text(head + block.partition("instrument.conformance")[0])
+    info = tmp_path / "site" / "my_package-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-package\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[instrument.stages]\nflagged = my_package:Flagged\n")
+    return tmp_path / "site"
+
+
+def command(strangers, where, *words):
+    return subprocess.run(
+        [sys.executable, "-m", "instrument.cli", *words], cwd=where, capture_output=True, text=True, timeout=300,
+        env={**os.environ, "PYTHONPATH": str(strangers)},
+    )  # fmt: skip
+
+
+def test_a_stage_of_a_stranger_works_from_a_scene_file_in_the_plan_and_in_the_report(strangers, tmp_path):
+    words = [w for s in (*SMALL, "flagged.most=0.2") for w in ("--set", s)]
+    done = command(strangers, tmp_path, "run", "mock-grid", *words, "--out", "out")
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"kept +stages +correct, flagged, image, analyze, in this order", done.stdout)
+    assert "flagged       at most 0 % of a station" in done.stdout
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert record["flagged"] == dict.fromkeys(["CS001HBA0", "CS003HBA1", "CS302HBA1", "RS106HBA"], 0.0)
+    assert record["scene"]["flagged"] == {"most": 0.2} and record["seconds"]["flagged"] >= 0
+    assert "<td>flagged</td>" in re.sub(r"<td[^>]*>", "<td>", (tmp_path / "out" / "report.html").read_text())
+    wrong = command(strangers, tmp_path, "run", "mock-grid", *words, "--set", "flagged.mots=1")
+    assert wrong.returncode == 2 and wrong.stderr.count("\n") == 1
+    assert "[flagged] Flagged has no 'mots': did you mean 'most'" in wrong.stderr
+    assert "flagged" in command(strangers, tmp_path, "plugins").stdout
+
+
+def test_what_a_run_finds_is_what_the_same_steps_find_by_hand_to_the_last_bit(tmp_path):
+    tables = small("noise.sefd='2820 Jy'", "seed=5")
+    found = run(parse(tables), tables, out=str(tmp_path / "out"), verify=False)
+    file = parse(tables)
+    scene = file.scene()
+    plan = file.plan(scene)
+    sums = ForcedPhotometry().start(plan.problem.sky.sources())
+    for block in plan.blocks():
+        sums.add(block.with_noise(2820 * u.Jy, seed=5003).without_beam(scene.instrument))
+    fluxes = sums.finish()
+    assert np.array_equal(found.stages["analyze"].parts[0].fluxes.stokes_jy, fluxes.stokes_jy)
+    table = QTable.read(tmp_path / "out" / "leakage.ecsv")
+    assert np.array_equal(table["I"].value, fluxes.stokes_jy[0, :, 0])
+
+
+class Late(Stage):
+    after = ("early", "not there")
+
+    def start(self, run):
+        raise NotImplementedError
+
+
+class Early(Late):
+    after = ()
+
+
+class Round(Late):
+    after = ("late",)
+
+
+def test_stages_come_after_those_that_they_name():
+    assert list(in_order({"a": Late(), "early": Early(), "late": Late(), "z": Round()})) == ["early", "a", "late", "z"]
+    with pytest.raises(InputError, match="each come after another of them"):
+        in_order({"early": Round(), "late": Late()})
+
+
+@pytest.mark.parametrize(
+    ("settings", "line"),
+    [
+        (["imgae={}"], r"SceneFile has no 'imgae': did you mean 'image'"),
+        (["noise=3"], r"'noise' must be a table, \[noise\]"),
+        (["calibrate.kind='selfcla'"], r"\[calibrate\] kind = 'selfcla': did you mean 'selfcal'"),
+        (["calibrate={}"], r"\[calibrate\] kind = None: .*incomplete-model.*many-directions"),
+        (["image.pixles=3"], r"\[image\] Imager has no 'pixles': did you mean 'pixels'"),
+        (["analyze.products=['spectrum-2d']", "image=0"], r"'image' must be a table"),
+    ],
+)
+def test_a_wrong_table_is_one_line_that_names_it(settings, line):
+    with pytest.raises(InputError, match=line) as error:
+        parse(small(*settings))
+    assert "\n" not in str(error.value)
+
+
+def test_products_of_images_ask_for_the_table_image():
+    tables = small("analyze.products=['spectrum-2d']")
+    del tables["image"]
+    with pytest.raises(InputError, match=r"\[analyze\] products = \['spectrum-2d'\] needs images"):
+        parse(tables)
