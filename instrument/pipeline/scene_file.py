@@ -161,7 +161,9 @@ class SceneFile(Component):
         for name, stage in self.running.items():
             with _in_table(name):
                 stage.check(scene)
-        if any(stage.perfect for stage in self.running.values()):
+        errors = [name for name in ("gain", "feed") if getattr(scene.instrument, name) is not None]
+        perfect = any(stage.perfect for stage in self.running.values())
+        if perfect:
             scene = scene.with_fields(instrument=scene.instrument.with_fields(gain=None, feed=None))
         found = scene.plan(
             tolerance=self.tolerance,
@@ -171,9 +173,15 @@ class SceneFile(Component):
             uv_range=self.products_uv_range(),
         )
         absent = [name for name in top_level() if name not in self.stages]
-        kept = (Item("stages", f"{', '.join(self.running)}, in this order"),) if self.running else ()
-        left_out = (Item(", ".join(absent), "absent from the scene"),) if absent else ()
-        return replace(found, kept=found.kept + kept, left_out=found.left_out + left_out)
+        kept, left_out = [*found.kept], [*found.left_out]
+        if perfect and errors:
+            kept.append(Item("receivers", f"{' and '.join(errors)}: put into the perfect blocks as they pass"))
+            left_out = [item for item in left_out if item.name not in ("GainTerm", "FeedTerm")]
+        if self.running:
+            kept.append(Item("stages", f"{', '.join(self.running)}, in this order"))
+        if absent:
+            left_out.append(Item(", ".join(absent), "absent from the scene"))
+        return replace(found, kept=tuple(kept), left_out=tuple(left_out))
 
     def _say_unused(self) -> None:
         """Name tables and keys that nothing will take."""
