@@ -179,5 +179,5 @@ def _write(result: CubeResults, paths: Sequence[str], command: str, folder: Path
         "seconds": {k: round(v, 3) for k, v in result.seconds.items()},
         **result.figures(),
     }
-    write_page(page_of_run(record, sections=result.sections(drawer(folder))), folder / "report.html")
+    write_page(page_of_run(record, result.cards(), sections=result.sections(drawer(folder))), folder / "report.html")
     (folder / "run.json").write_text(json_text(record), encoding="utf-8")

@@ -78,13 +78,12 @@ def cylinder_ratio(window: EoRWindow, removed: float = 0.0, reduced: float = 0.7
     for share, look in ((removed, "-"), (reduced, "--")):
         level = window.ratio(share)
         _rim(ax, spectrum, np.where(window.unknown, np.nan, level), look)
-        name = f"ratio 1, {share:.0%} removed" if share else "ratio 1, as it is"
+        which = f"{share:.0%} removed" if share else "as it is"
         if np.nanmin(level) < 1 < np.nanmax(level):
-            keys.append(Line2D([], [], color=INK, ls=look, lw=2, label=name))
+            keys.append(Line2D([], [], color=INK, ls=look, lw=2, label=f"ratio 1, {which}"))
         else:
-            keys.append(
-                Line2D([], [], ls="", label=f"{share:.0%} removed: {'below' if np.nanmax(level) < 1 else 'above'} 1")
-            )
+            side = "below" if np.nanmax(level) < 1 else "above"
+            keys.append(Line2D([], [], ls="", label=f"{which}: all {side} 1"))
     if window.wedge.any():
         keys.append(Patch(fc="none", ec=INK, hatch="///", lw=0, label="wedge: not counted"))
     ax.legend(handles=keys, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3, frameon=False, handlelength=1.6)

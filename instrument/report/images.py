@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -49,7 +50,7 @@ def stokes_images(cube: StokesCube, channel: int = 0) -> Figure:
         bar = figure.colorbar(drawn, ax=ax, fraction=0.046, pad=0.02, extend=_beyond(plane, low, high))
         bar.locator = MaxNLocator(5)
         bar.update_ticks()
-        ax.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
+        ax.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))  # "-0.5" and "-1.0" met with 6
         ax.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
         if cube.psf is not None and np.isfinite(cube.psf.major_rad[channel]):
             _draw_psf(ax, cube, channel)
@@ -139,11 +140,14 @@ def _beyond(plane: Float, low: float, high: float) -> str:
 
 
 def _prefix(value: float) -> tuple[float, str]:
-    """The factor that brings a value to 1 to 1000, and the metric prefix it stands for."""
+    """The factor that brings a value to 1 to 1000, and the metric prefix or power of ten it stands for."""
     for factor, prefix in ((1e-3, "k"), (1, ""), (1e3, "m"), (1e6, "µ"), (1e9, "n"), (1e12, "p")):
         if value * factor >= 1:
             return factor, prefix
-    return 1.0, ""
+    if not value > 0:
+        return 1.0, ""
+    power = math.floor(math.log10(value))  # below the prefixes: what rounding leaves of a Stokes parameter
+    return 10.0**-power, f"$10^{{{power}}}$ "
 
 
 def _ellipse(at: tuple[float, float], cube: StokesCube, channel: int, per_deg: float, **look: Any) -> Ellipse:

@@ -29,7 +29,7 @@ def page_of_run(
         *tables,
         Section("To run it again", _again(record)),
     ]
-    finished = record.get("finished", "").replace("T", " ")
+    finished = record.get("finished", "").replace("T", " ").replace("+00:00", " UTC")
     verdicts = {name: check.get("passed", True) for name, check in record.get("checks", {}).items()}
     short = [name for name, passed in verdicts.items() if passed is False]
     unmade = [name for name, passed in verdicts.items() if passed is None]
@@ -64,7 +64,7 @@ def _cards(record: Mapping[str, Any]) -> list[Card]:
         cards.append(Card("Prediction error", f"{check['error']:.1e}", note, "good" if check["passed"] else "bad"))
     if seconds := record.get("seconds"):
         parts = [record.get("plan", {}).get("engine"), record.get("machine", {}).get("workers")]
-        note = f"engine {parts[0]}, {parts[1]} workers" if all(parts) else ""
+        note = (f"engine {parts[0]}, {parts[1]} workers; " if all(parts) else "") + "without writing"
         cards.append(Card("Wall time", duration(sum(seconds.values())), note))
     return cards
 
@@ -106,7 +106,7 @@ def _stages(record: Mapping[str, Any]) -> list[Block]:
         own = wrong.get(stage) or ("" if any(wrong.get(part) for part in inside) else "–")
         rows.append([stage, Cell(duration(spent), bar=spent / longest), own])
         rows += [
-            [f"\u2003{part}", Cell(duration(took), bar=took / longest), wrong.get(part, "")]
+            [f"\u2003{part}".replace(" ", "\u00a0"), Cell(duration(took), bar=took / longest), wrong.get(part, "")]
             for part, took in sorted(inside.items(), key=lambda item: -item[1])
         ]
     return [Table(["stage", "time", "how wrong it may be"], rows)]

@@ -22,7 +22,7 @@ from instrument.errors import InputError, Outcome
 from instrument.foreground.base import Split
 from instrument.image.cube import StokesCube
 from instrument.pipeline.stage import Draw, StageResult
-from instrument.report.page import Section
+from instrument.report.page import Card, Section, number
 
 
 @dataclass
@@ -132,6 +132,13 @@ class CubeResults(StageResult):
         """Its checks, and what was found, under "cube"."""
         found = self.figures()
         return {"checks": found.pop("checks"), "stage_errors": found.pop("stage_errors"), "cube": found}
+
+    def cards(self) -> list[Card]:
+        """How far each window is open."""
+        return [
+            Card(f"EoR window, {name or 'as it is'}", f"{number(100 * window.area()[1])} %", "of the area of the bins")
+            for name, window in self.windows.items()
+        ]
 
     def sections(self, draw: Draw) -> list[Section]:
         """Faraday depth, removal, spectra, window."""

@@ -15,7 +15,7 @@ from instrument.calibrate.directional import DirectionalCal
 from instrument.image.dirty import Imager
 from instrument.pipeline.stage import Beside, Draw, Running, Stage, StageResult, StageRun
 from instrument.pipeline.stages.noise import STEP, Noise
-from instrument.report.page import Figures, Section, Table, Text
+from instrument.report.page import Card, Details, Figures, Section, Table, Text, number
 from instrument.visibilities import Visibilities
 
 
@@ -144,9 +144,20 @@ class SubtractionResult(StageResult):
         """The table."""
         self.found.write(folder)
 
+    def cards(self) -> list[Card]:
+        """What is left, and how much more one direction for all leaves."""
+        of = "of the noise" if self.found.noise_jy else "of the data"
+        return [
+            Card("Left after subtraction", number(self.found.left, 4), of, "good" if self.passed else "bad"),
+            Card("One direction for all", f"{number(self.found.ratio)} ×", "as much is left"),
+        ]
+
     def sections(self, draw: Draw) -> list[Section]:
-        """The table of clusters, and what is left in words."""
-        rows = Table.of(
-            self.found.table(), "Rms of visibilities; one: with one direction for all. Errors without the gauge."
-        )
-        return [Section("Many directions", [Text("\n".join(self.found.lines()), code=True), rows])]
+        """Clusters, and what is left, in words."""
+        return [Section("Many directions", [Text("\n".join(self.found.lines()), code=True)])]
+
+    def tables(self) -> list[Section]:
+        """The table of clusters with all that was measured."""
+        text = "Rms of visibilities; one: with one direction for all. Errors without the gauge."
+        rows = Table.of(self.found.table(), text)
+        return [Section("All clusters", [Details(f"{len(self.found.names)} clusters, and what holds for all", [rows])])]
