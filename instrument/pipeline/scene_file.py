@@ -178,9 +178,9 @@ class SceneFile(Component):
             kept.append(Item("receivers", f"{' and '.join(errors)}: put into the perfect blocks as they pass"))
             left_out = [item for item in left_out if item.name not in ("GainTerm", "FeedTerm")]
         if self.running:
-            kept.append(Item("stages", f"{', '.join(self.running)}, in this order"))
+            kept.append(Item("stages", ", ".join(self.running) + (", in this order" if len(self.running) > 1 else "")))
         if absent:
-            left_out.append(Item(", ".join(absent), "absent from the scene"))
+            left_out.append(Item("other stages", f"not in the scene: {', '.join(absent)}"))
         return replace(found, kept=tuple(kept), left_out=tuple(left_out))
 
     def _say_unused(self) -> None:
@@ -230,9 +230,12 @@ def parse(tables: dict[str, Any]) -> SceneFile:
     known = top_level()
     for name, value in tables.items():
         if name not in own and name not in known:
-            raise InputError(f"SceneFile has no '{name}': {did_you_mean(name, [*own, *known])}")
+            raise InputError(f"a scene has no '{name}': {did_you_mean(name, [*own, *known])}")
         if (name in known or name in ("instrument", "observation", "sky")) and not isinstance(value, dict):
             raise InputError(f"'{name}' must be a table, [{name}]")
+    for name in ("instrument", "observation", "sky"):
+        if name not in tables:
+            raise InputError(f"a scene needs a table [{name}]")
     return SceneFile(
         **{name: value for name, value in tables.items() if name in own},
         tables={name: value for name, value in tables.items() if name in known},

@@ -106,10 +106,12 @@ def test_stages_come_after_those_that_they_name():
 @pytest.mark.parametrize(
     ("settings", "line"),
     [
-        (["imgae={}"], r"SceneFile has no 'imgae': did you mean 'image'"),
+        (["imgae={}"], r"a scene has no 'imgae': did you mean 'image'"),
         (["noise=3"], r"'noise' must be a table, \[noise\]"),
         (["calibrate.kind='selfcla'"], r"\[calibrate\] kind = 'selfcla': did you mean 'selfcal'"),
-        (["calibrate={}"], r"\[calibrate\] kind = None: .*incomplete-model.*many-directions"),
+        (["calibrate={}"], r"\[calibrate\] needs 'kind': .*incomplete-model.*many-directions"),
+        (["analyze.products='leakage'"], r"\[analyze\] products = 'leakage' must be a list"),
+        (["observation.frequency='150 MHz'"], r"observation: frequency = '150 MHz' must be a table"),
         (["image.pixles=3"], r"\[image\] Imager has no 'pixles': did you mean 'pixels'"),
         (["analyze.products=['spectrum-2d']", "image=0"], r"'image' must be a table"),
     ],
@@ -125,3 +127,23 @@ def test_products_of_images_ask_for_the_table_image():
     del tables["image"]
     with pytest.raises(InputError, match=r"\[analyze\] products = \['spectrum-2d'\] needs images"):
         parse(tables)
+
+
+def test_a_scene_without_one_of_its_first_tables_is_told_which():
+    tables = small()
+    del tables["sky"]
+    with pytest.raises(InputError, match=r"a scene needs a table \[sky\]"):
+        parse(tables)
+
+
+def test_products_of_many_channels_are_refused_by_the_plan_of_one():
+    file = parse(small("analyze.cube.products=['spectrum-2d', 'faraday']"))
+    with pytest.raises(InputError, match=r"\[analyze.cube\] products = 'faraday': one channel"):
+        file.plan(file.scene())
+
+
+def test_a_plan_says_that_errors_of_receivers_are_put_in_later():
+    file = parse(small("calibrate.kind='selfcal'", "instrument.gain={rms=1e-3}"))
+    plan = file.plan(file.scene())
+    assert ("receivers", "gain: put into the perfect blocks as they pass") in [item[:2] for item in plan.kept]
+    assert "GainTerm" not in [item.name for item in plan.left_out]

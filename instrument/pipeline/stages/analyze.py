@@ -47,10 +47,13 @@ class Analyze(Stage):
         return (self.uv_range,) if "leakage" in self.products else ()
 
     def check(self, scene: Scene) -> None:
-        """Name settings of products that are not made."""
+        """Name settings of products that are not made; refuse products that one channel does not allow."""
         if "leakage" not in self.products:
             given = [key for key in ("uv_range", "every") if key in self.model_fields_set]
             unused("[analyze]", given, "they are of the product 'leakage'")
+        asked = [name for name in (self.cube and self.cube.products) or () if name != "spectrum-2d"]
+        if asked and scene.observation.freq_hz.size < 2:
+            raise InputError(f"[analyze.cube] products = '{asked[0]}': one channel; give more, or take 'spectrum-2d'")
 
     def start(self, run: Running) -> StageRun:
         """The stage at work."""

@@ -21,7 +21,7 @@ from instrument.jones.chain import Chain
 from instrument.pipeline.stage import Beside, Draw, Running, Stage, StageResult, StageRun
 from instrument.pipeline.stages.image import Image
 from instrument.registry import names
-from instrument.report.page import Block, Figures, Section, Table, Text
+from instrument.report.page import Block, Card, Figures, Section, Table, Text, number
 from instrument.visibilities import Visibilities
 from instrument.whole_file import write_ecsv
 
@@ -43,8 +43,9 @@ class Calibrate(Stage):
         """The stage; the settings are those of the solver."""
         kind = settings.get("kind")
         if kind != "selfcal":
+            said = "needs 'kind'" if kind is None else f"kind = {kind!r}"
             known = ["selfcal", *(n.partition(".")[2] for n in names("stages") if n.startswith("calibrate."))]
-            raise InputError(f"kind = {kind!r}: {did_you_mean(str(kind), known)}")
+            raise InputError(f"{said}: {did_you_mean(str(kind), known)}")
         return cls(calibrator=SelfCal(**{key: value for key, value in settings.items() if key != "kind"}))
 
     def start(self, run: Running) -> StageRun:
@@ -151,6 +152,15 @@ class CalibrationResult(StageResult):
             for name in IMAGES[1:]
             for s in stokes
         }
+
+    def cards(self) -> list[Card]:
+        """How many intervals converged, and what calibration leaves."""
+        done = self.solution.converged
+        left = number(100 * self.rms["corrected - model"] / self.rms["model"]) if self.rms["model"] else "–"
+        return [
+            Card("Converged", f"{int(done.sum())} of {done.size}", "intervals", "good" if self.passed else "bad"),
+            Card("Left by calibration", f"{left} %", "corrected less model, of the visibility rms"),
+        ]
 
     def sections(self, draw: Draw) -> list[Section]:
         """Errors of the solutions, gains against time, how it converged, and what is left."""
