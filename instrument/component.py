@@ -252,7 +252,9 @@ def one_line(cls: type[BaseModel], error: ValidationError) -> str:
             parts.append(f"{where}: {message}" if inside else message)
         elif kind in ("model_type", "dict_type"):
             keys = " = ..., ".join(_fields_at(cls, item["loc"]))
-            parts.append(f"{where} = {brief(item['input'])} must be a table{keys and f': {{ {keys} = ... }}'}")
+            parts.append(
+                f"{where or cls.__name__} = {brief(item['input'])} must be a table{keys and f': {{ {keys} = ... }}'}"
+            )
         elif kind in ("tuple_type", "list_type"):
             parts.append(f"{where} = {brief(item['input'])} must be a list, in brackets")
         else:

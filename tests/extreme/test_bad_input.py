@@ -106,7 +106,7 @@ def test_a_broken_scene_file_names_file_and_line(tiny, capsys):
     assert "broken.toml" in line
     assert "line 2" in line
     (tiny / "empty.toml").write_text('name = "x"\n')
-    assert "needs 'instrument'" in refused(capsys, "run", "empty.toml")
+    assert "a scene needs a table [instrument]" in refused(capsys, "run", "empty.toml")
 
 
 def test_a_folder_that_is_not_empty_is_left_alone(tiny, capsys):

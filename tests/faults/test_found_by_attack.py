@@ -174,15 +174,16 @@ def test_settings_without_meaning_are_refused():
     refused(lambda: analyzer.rm_synthesis([0.0], lambda2_0=-1.0), "lambda2_0 = -1", "0")
 
 
-def test_a_table_given_as_a_list_or_text_is_refused_in_our_words(tmp_path, capsys):
+def test_a_table_given_as_a_list_or_text_is_refused_in_our_words(capsys):
     from instrument.cli import main
 
-    scene = tmp_path / "x.toml"
-    scene.write_text('name = "x"\n[observation]\nfrequency = "150 MHz"\n[image]\nuv_range = "3,80"\n')
-    assert main(["plan", str(scene)]) == 2
-    said = capsys.readouterr().err
-    assert "frequency = '150 MHz' must be a table" in said and "centre" in said
-    assert "uv_range = '3,80' must be a list" in said
+    for wrong, *words in (
+        ("observation.frequency='150 MHz'", "frequency = '150 MHz' must be a table", "centre"),
+        ("image.uv_range='3,80'", "uv_range = '3,80' must be a list"),
+    ):
+        assert main(["plan", "mock-grid", "--set", wrong]) == 2
+        said = capsys.readouterr().err
+        assert all(word in said for word in words), said
 
 
 # Inverses and zeros that are no answer -------------------------------------------------------------------------------

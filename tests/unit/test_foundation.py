@@ -342,7 +342,7 @@ def test_a_whole_scene_comes_back_from_json():
     ("text", "message"),
     [
         ("{", "not JSON"),
-        ("[1, 2]", "dictionary"),
+        ("[1, 2]", r"^JonesTerm = \[1, 2\] must be a table$"),
         ('{"kind": "os:path"}', "no JonesTerm is called 'os:path'"),
         ('{"kind": 3}', "kind = 3 must be the name of a class"),
         ('{"kind": "GianTerm"}', "did you mean 'GainTerm'"),
