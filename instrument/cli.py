@@ -227,7 +227,7 @@ def _plugins(given: argparse.Namespace) -> int:
         show(f"{kind}" if found else f"{kind} (none)")
         for plugin in found.values():
             show(
-                f"  {plugin.name:<18} {plugin.package:<14} {plugin.target}"
+                f"  {plugin.name:<27} {plugin.package:<14} {plugin.target}"
                 + (f"\n    BROKEN: {plugin.broken}" if plugin.broken else "")
                 + (f"\n    lacks {plugin.lacks}" if plugin.lacks else "")
             )

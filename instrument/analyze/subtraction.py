@@ -96,7 +96,8 @@ class ManyDirectionsResult:
             *lines,
             f"left after subtraction      {self.left:{form}} of {unit} ({self.scale_jy:.3g} Jy), {due} is due; "
             f"{wrong} wrongly subtracted",
-            f"with one direction for all  {one} of {unit}, {self.ratio:.3g} times as much; {one_wrong} wrongly subtracted",
+            f"with one direction for all  {one} of {unit}, {self.ratio:.3g} times as much; "
+            f"{one_wrong} wrongly subtracted",
         ]
 
     def write(self, folder: str | os.PathLike[str]) -> None:

@@ -95,7 +95,8 @@ class SweepResult(StageResult):
 
     def record(self) -> dict[str, Any]:
         """Whether every solve converged."""
-        return {"checks": {"solutions": {"outcome": [], "passed": self.passed}}}
+        text = "all converged" if self.passed else "some intervals did not converge"
+        return {"checks": {"solutions": {"outcome": [text], "passed": self.passed}}}
 
     def lines(self) -> list[str]:
         """One line a model."""
@@ -134,7 +135,8 @@ class SubtractionResult(StageResult):
 
     def record(self) -> dict[str, Any]:
         """Whether every solve converged."""
-        return {"checks": {"solutions": {"outcome": [], "passed": self.passed}}}
+        text = "all converged" if self.passed else "some intervals did not converge"
+        return {"checks": {"solutions": {"outcome": [text], "passed": self.passed}}}
 
     def lines(self) -> list[str]:
         """One line a cluster, and what is left."""
