@@ -53,6 +53,7 @@ class Component(BaseModel, ABC):
         allow_inf_nan=False,
     )
     plugin_kind: ClassVar[str | None] = None
+    settings_of: ClassVar[tuple[type[Component], ...]] = ()  # whose fields are the keys of its text, if not its own
     needs: ClassVar[dict[str, str]] = {}  # modules beyond those of this package, and the packages they come with
 
     def __init__(self, /, *values: Any, **fields: Any) -> None:

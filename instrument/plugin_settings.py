@@ -35,7 +35,8 @@ def _lines(kind: str, plugin: Plugin) -> Iterator[str]:
         return
     cls = plugin_class(kind, plugin.name, needed=True)
     yield from (f"  {line}".rstrip() for line in (inspect.getdoc(cls) or "").splitlines())
-    rows = [_row(cls, name) for name in cls.model_fields] if issubclass(cls, Component) else []
+    own = (cls.settings_of or (cls,)) if issubclass(cls, Component) else ()
+    rows = [_row(one, name) for one in own for name in one.model_fields]
     yield ""
     if not rows:
         yield "  no settings"

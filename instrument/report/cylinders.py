@@ -55,10 +55,13 @@ def cylinder(
 
 
 @styled
-def cylinder_ratio(window: EoRWindow, removed: float = 0.0, reduced: float = 0.7, ax: Axes | None = None) -> Axes:
+def cylinder_ratio(
+    window: EoRWindow, removed: float = 0.0, reduced: float = 0.7, ax: Axes | None = None, name: str = "as it is"
+) -> Axes:
     """Leakage and noise over the 21-cm signal (P, L), with contours at 1 for the leakage as it is and reduced.
 
-    Blue is below the signal: the window. Grey bins are unknown, hatched ones are in the wedge.
+    Blue is below the signal: the window. Grey bins are unknown, hatched ones are in the wedge. `name` is what the
+    leakage is called where none of it is taken away.
     """
     spectrum = window.leakage
     ax = axes_of(ax, (6.8, 5.4))
@@ -66,7 +69,7 @@ def cylinder_ratio(window: EoRWindow, removed: float = 0.0, reduced: float = 0.7
     shown = np.where(window.unknown | ~(values > 0), np.nan, values)
     power = np.log10(shown)
     reach = float(np.clip(np.nanmax(np.abs(power), initial=1.0), 1.0, 4.0))
-    what = f"{removed:.0%} removed" if removed else "leakage as it is"
+    what = f"{removed:.0%} removed" if removed else f"leakage {name}"
     title = f"leakage over signal, {what}"
     label = "log$_{10}$ ratio of power"
     _mesh(spectrum, power, Normalize(-reach, reach), "RdBu_r", label, title, (), ax, extend="both")
@@ -78,7 +81,7 @@ def cylinder_ratio(window: EoRWindow, removed: float = 0.0, reduced: float = 0.7
     for share, look in ((removed, "-"), (reduced, "--")):
         level = window.ratio(share)
         _rim(ax, spectrum, np.where(window.unknown, np.nan, level), look)
-        which = f"{share:.0%} removed" if share else "as it is"
+        which = f"{share:.0%} removed" if share else name
         if np.nanmin(level) < 1 < np.nanmax(level):
             keys.append(Line2D([], [], color=INK, ls=look, lw=2, label=f"ratio 1, {which}"))
         else:

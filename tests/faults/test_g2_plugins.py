@@ -31,6 +31,16 @@ def test_g2_settings_are_listed_with_units_and_defaults(capsys):
     assert "5 deg" in shown and "a whole number of at least 1" in shown
 
 
+def test_g2_the_settings_of_a_stage_are_the_keys_of_its_table(capsys):
+    for name, *keys in (
+        ("image", "pixels", "uv_range"), ("calibrate", "tolerance", "interval"), ("analyze", "products", "every"),
+        ("calibrate.many-directions", "clusters", "tolerance"), ("calibrate.incomplete-model", "models"),
+    ):  # fmt: skip
+        rows = [line.split()[0] for line in told(capsys, name)[1].splitlines() if line.strip()]
+        assert set(keys) <= set(rows), name
+        assert not {"imager", "calibrator needed", "laboratory"} & set(rows)
+
+
 def test_g2_every_plugin_can_be_described(capsys):
     for name in {name for kind in KINDS for name in available(kind)}:
         status, shown, said = told(capsys, name)

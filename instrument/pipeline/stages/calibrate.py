@@ -13,6 +13,7 @@ from instrument.analyze.analyzer import Analyzer
 from instrument.calibrate.base import Solution
 from instrument.calibrate.di_errors import DIComparison, DISums
 from instrument.calibrate.selfcal import SelfCal
+from instrument.component import Component
 from instrument.errors import InputError, Outcome, did_you_mean
 from instrument.files.solutions import write_h5parm
 from instrument.image.cube import StokesCube
@@ -36,6 +37,7 @@ class Calibrate(Stage):
 
     after: ClassVar[tuple[str, ...]] = ("noise",)
     perfect: ClassVar[bool] = True
+    settings_of: ClassVar[tuple[type[Component], ...]] = (SelfCal,)
     calibrator: SelfCal
 
     @classmethod

@@ -128,7 +128,8 @@ def _window(result: CubeResults, figure: Draw) -> Section | None:
         file = f"window{'_' if name else ''}{name.replace(' ', '_')}"
         text = "Power of Stokes I, taken as leakage, over that of the 21-cm signal" + (f", {name}." if name else ".")
         if window.counts.any():
-            entries.append(figure(file, cylinder_ratio(window, reduced=result.settings.removed), text))
+            drawn = cylinder_ratio(window, reduced=result.settings.removed, name=name or "as it is")
+            entries.append(figure(file, drawn, text))
     columns = ("removed_percent", "leakage_percent", "power_left", "ixr_m_db", "ixr_j_db")
     heads = ["leakage removed (%)", "leakage left (%)", "power left", "IXR_M (dB)", "IXR_J (dB)"]
     rows = [[float(row[name]) for name in columns] for row in removal_table()]

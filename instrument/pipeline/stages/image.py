@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from instrument.component import Component
 from instrument.errors import unused
 from instrument.image.cube import StokesCube
 from instrument.image.dirty import Imager, Images
@@ -23,6 +24,7 @@ class Image(Stage):
     """Images by an `imager`, whose settings are those of the table."""
 
     after: ClassVar[tuple[str, ...]] = ("noise", "calibrate", "correct")
+    settings_of: ClassVar[tuple[type[Component], ...]] = (Imager,)
     imager: Imager
 
     @classmethod

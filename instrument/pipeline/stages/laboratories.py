@@ -12,6 +12,7 @@ from instrument.analyze.many_directions import ManyDirections
 from instrument.analyze.subtraction import ManyDirectionsResult
 from instrument.analyze.sweep import Sweep
 from instrument.calibrate.directional import DirectionalCal
+from instrument.component import Component
 from instrument.image.dirty import Imager
 from instrument.pipeline.stage import Beside, Draw, Running, Stage, StageResult, StageRun
 from instrument.pipeline.stages.noise import STEP, Noise
@@ -31,6 +32,7 @@ class IncompleteModelStage(Stage):
     """Calibrates on the n brightest sources, for every n asked for; settings are those of `IncompleteModel`."""
 
     alone: ClassVar[tuple[str, ...] | None] = ("noise", "image")
+    settings_of: ClassVar[tuple[type[Component], ...]] = (IncompleteModel,)
     laboratory: IncompleteModel
 
     @classmethod
@@ -48,6 +50,7 @@ class ManyDirectionsStage(Stage):
     """Solves for clusters of sources at once; settings are those of `ManyDirections` and of its `DirectionalCal`."""
 
     alone: ClassVar[tuple[str, ...] | None] = ("noise",)
+    settings_of: ClassVar[tuple[type[Component], ...]] = (ManyDirections, DirectionalCal)
     laboratory: ManyDirections
 
     @classmethod
