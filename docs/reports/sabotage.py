@@ -23,6 +23,7 @@ from instrument import Observation, Scene
 
 HERE = Path(__file__).parent
 KINDS = ("station", "baseline", "time", "channel")
+TIMES = {"station": 1, "baseline": 1, "time": 5, "channel": 1}  # more cases of what is found by chance
 
 
 def scene(times, channels, stations=()):
@@ -70,7 +71,7 @@ def hunt(plan, cases, rng):
     sizes = dict(zip(KINDS, (len(plan.problem.at.layout), baselines, times, channels), strict=True))
     found, looked = dict.fromkeys(KINDS, 0), dict.fromkeys(KINDS, 0)
     for kind in KINDS:
-        for seed in range(cases):
+        for seed in range(cases * TIMES[kind]):
             checker = plan.watched(seed=seed).checker
             k = int(rng.integers(sizes[kind]))
             for t, f in checker.chosen():  # of the blocks, what the check looks at
@@ -99,7 +100,7 @@ def main():
     share = {"station": 1.0, "baseline": 1.0}
     share |= {"time": check.times.seen / check.times.of, "channel": check.channels.seen / check.channels.of}
     rows = [
-        f"| {kind} | {found[kind]} of {given.cases} | {looked[kind]} | {share[kind] * given.cases:.1f} |"
+        f"| {kind} | {found[kind]} of {(n := given.cases * TIMES[kind])} | {looked[kind]} | {share[kind] * n:.1f} |"
         for kind in KINDS
     ]
     text = f"""# Flipped signs in what an engine produced
