@@ -260,8 +260,8 @@ def test_f6_sabotage_of_59_stations(sabotage):
     assert found == looked  # what was looked at is found, always
     assert found["station"] == found["baseline"] == 20
     for kind, seen in (("time", check.times), ("channel", check.channels)):
-        share = seen.seen / seen.of
-        assert abs(found[kind] - 20 * share) <= 4 * np.sqrt(20 * share * (1 - share)) + 0.5
+        share, cases = seen.seen / seen.of, 20 * sabotage.TIMES[kind]
+        assert abs(found[kind] - cases * share) <= 4 * np.sqrt(cases * share * (1 - share)) + 0.5
 
 
 # A6, A7: what is not modelled ---------------------------------------------------------------------------------------
