@@ -223,7 +223,7 @@ def test_integers_are_numbers(name):
 
 
 def test_complex_cubes_are_refused():
-    with pytest.raises(InputError, match="needs real numbers"):
+    with pytest.raises(InputError, match="needed real numbers"):
         residual("pca", smooth(1).astype(complex))
 
 

@@ -26,7 +26,7 @@ COUNTS = {"seed", "samples", "count", "bins", "bins_par", "workers", "components
 COUNTS |= {"pixels", "rms", "tolerance", "channel", "indent"}
 # errors, enumerations, and what only a subclass can be; a Direction is a plain tuple, checked wherever it is taken
 NOT_WALKED = {"Component", "InputError", "InstrumentError", "InstrumentWarning", "Outcome", "Simplified", "__version__"}
-NOT_WALKED |= {"Direction", "ScalarTerm", "Predictor"}
+NOT_WALKED |= {"Direction", "ScalarTerm", "Predictor", "Stage", "StageRun", "StageResult"}  # those of others are
 # (what, argument, poison): why it is accepted
 MEANT: dict[tuple[str, str, str], str] = {
     ("Analyzer.rm_synthesis", "divide_by_i", "True"): "by the way that suits the signal",
@@ -259,6 +259,7 @@ def calls():
         ins.load("skies", "faraday"),
         ins.load("elements", "dipole", height="0.5 m"),
     ]
+    things += [ins.load("stages", "noise", sefd="100 Jy", seed=1), ins.load("stages", "analyze")]
     things += [ins.load("foregrounds", n) for n in ("gmca", "pca", "faraday-filter", "gpr")]
     things += [*station.parts(), station.levels[0]]
     for thing in things:
