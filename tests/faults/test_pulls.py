@@ -47,13 +47,13 @@ def test_the_modes_of_the_first_ring_behind_a_taper_are_those_of_a_closed_form()
     assert modes == pytest.approx(16 / (side + corner), rel=1e-6)
 
 
-@pytest.mark.parametrize("draws, margin", [(12, 0.35), pytest.param(1000, 0.1, marks=pytest.mark.long)])
+@pytest.mark.parametrize("draws, margin", [(12, 0.35), pytest.param(300, 0.1, marks=pytest.mark.long)])
 def test_errors_of_powers_are_their_scatter(pulls, draws, margin):
-    """The median of some 6 to 72 bins; the lowest and highest of so many lie 3 spreads of 2.2 % further out."""
+    """The median of some 6 to 72 bins; the lowest and highest of so many lie 3.5 spreads of 4 % further out."""
     rows = pulls.spectra(draws, 1)
     assert off([row for row in rows if "median" in row[1]], 1 - margin, 1 + margin) == []
-    if draws == 1000:
-        assert off(rows, 1 - margin - 0.03, 1 + margin + 0.03) == []
+    if draws == 300:
+        assert off(rows, 1 - margin - 0.14, 1 + margin + 0.14) == []
 
 
 @pytest.mark.parametrize("draws, margin", [(20, 0.35), pytest.param(1000, 0.1, marks=pytest.mark.long)])
