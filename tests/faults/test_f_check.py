@@ -253,6 +253,15 @@ flux = "1 Jy"
     assert "verify" in json.loads((tmp_path / "out" / "run.json").read_text())["seconds"]
 
 
+def test_f6_any_time_is_looked_at_as_often_as_the_share_that_is_printed(plan):
+    times = plan.problem.shape[0]
+    share = len(plan.watched(samples=1, seed=0).checker.cells) / times
+    assert 0 < share < 0.7
+    rng, cases = np.random.default_rng(3), 1000
+    hits = sum(int(rng.integers(times)) in plan.watched(samples=1, seed=s).checker.cells for s in range(cases))
+    assert abs(hits - cases * share) <= 4 * np.sqrt(cases * share * (1 - share))
+
+
 @pytest.mark.long
 def test_f6_sabotage_of_59_stations(sabotage):
     plan = sabotage.scene(48, 16).plan(memory="8 GB")
