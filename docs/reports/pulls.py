@@ -296,7 +296,10 @@ def _confused(draws, seed, vis, sky, sefd, fall):
     return np.concatenate(off), np.concatenate(leaked)
 
 
-def scores(draws: int, seed: int = 0) -> list[Row]:
+SCORED = (("polynomial", 1.0), ("pca", 1.0), ("gpr", 0.4), ("gmca", 0.2))  # removers, and their share of the draws
+
+
+def scores(draws: int, seed: int = 0, removers: tuple[tuple[str, float], ...] = SCORED) -> list[Row]:
     """Scores of foreground removals without the truth about the true score of each draw; fewer draws of gpr and gmca.
 
     Leakage of 7.1 mK, 32 x 32 x 81; where a lower bound is said no error is printed and none is counted.
@@ -308,7 +311,7 @@ def scores(draws: int, seed: int = 0) -> list[Row]:
     like = leaked(polarized_screens(pixels=32, pixel=2 * u.arcmin, frequencies=frequencies, screens=FINE, seed=1))
     truth = like.with_data(like.data * np.float32(7.1e-3 / like.data[:, 0].std()))
     rows: list[Row] = []
-    for name, times in (("polynomial", 1.0), ("pca", 1.0), ("gpr", 0.4), ("gmca", 0.2)):
+    for name, times in removers:
         remover = instrument.load("foregrounds", name)
         for noise, shaped in ((1, False), (10, False), (30, False), (20, True)):
             found = []

@@ -86,6 +86,13 @@ def hunt(plan, cases, rng):
     return found, looked, watched.check, predicted, time.process_time() - begin
 
 
+def looked_at(plan, cases=4000):
+    """Of so many times drawn, how many are among those that a check looks at, every check with a seed of its own."""
+    times, rng = plan.problem.shape[0], np.random.default_rng(1)
+    checks = [plan.watched(seed=seed).checker.cells for seed in range(200)]
+    return sum(int(rng.integers(times)) in checks[k % 200] for k in range(cases)), cases
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--times", type=int, default=288)
@@ -97,6 +104,7 @@ def main():
     for _ in few.blocks():
         pass  # compiled
     found, looked, check, predicted, spent = hunt(plan, given.cases, np.random.default_rng(0))
+    hits, drawn = looked_at(plan)
     share = {"station": 1.0, "baseline": 1.0}
     share |= {"time": check.times.seen / check.times.of, "channel": check.channels.seen / check.channels.of}
     rows = [
@@ -116,6 +124,8 @@ as they stream by; every case has its own seed. Unspoilt data: {check}.
 |---|---|---|---|
 """ + "\n".join(rows)
     text += f"""
+
+Times are looked at by chance: of {drawn} drawn {hits} were among those looked at, {drawn * share["time"]:.0f} are due.
 
 Processor time: the check {spent:.2f} s, the prediction {predicted:.1f} s, {100 * spent / predicted:.1f} %
 of it, and of a run that does nothing else.
