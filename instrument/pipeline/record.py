@@ -90,8 +90,8 @@ def record(result: Result, tables: dict[str, Any]) -> dict[str, Any]:
             "text": str(check),
             "passed": check.passed if check.made else None,
         }
-    for stage in result.stages.values():
-        merge(out, stage.record())
+    for name, stage in result.stages.items():
+        merge(out, stage.record(), name)
     return out
 
 

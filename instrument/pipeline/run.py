@@ -9,16 +9,17 @@ from pathlib import Path
 from typing import Any
 
 from instrument.errors import unused_ledger
+from instrument.jones.chain import Chain
 from instrument.pipeline.folder import RunFolder
 from instrument.pipeline.progress import progress_bar
 from instrument.pipeline.record import Result, json_text, record, summary
 from instrument.pipeline.scene_file import SceneFile
 from instrument.pipeline.scene_text import to_toml
-from instrument.pipeline.stage import Running, StageRun
-from instrument.pipeline.stages.receivers import NAME, Receivers
+from instrument.pipeline.stage import EachBlock, Running, StageRun
 from instrument.visibilities import Visibilities
 
 PREDICT = "predict"
+RECEIVERS = "receivers"  # their errors are put into perfect blocks, where a stage compares with a perfect instrument
 
 
 def run(
@@ -92,7 +93,8 @@ def stream(
 
     work: dict[str, StageRun] = {}
     if any(stage.perfect for stage in run.stages.values()):
-        work[NAME] = Receivers(run.instrument)
+        errors = Chain(*run.instrument.receivers())
+        work[RECEIVERS] = EachBlock(lambda block: block.corrupted(errors))
     for name, stage in run.stages.items():
         with at_work(name):
             work[name] = stage.start(run)

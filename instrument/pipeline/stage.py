@@ -136,6 +136,17 @@ class StageRun:
         return StageResult()
 
 
+class EachBlock(StageRun):
+    """A stage that makes another block of every block, and keeps nothing."""
+
+    def __init__(self, change: Callable[[Visibilities], Visibilities]) -> None:
+        self.change = change
+
+    def take(self, block: Visibilities) -> Visibilities:
+        """The block as it was changed."""
+        return self.change(block)
+
+
 class StageResult:
     """What a stage has made, and how it is told: in run.json, on the terminal, in files, on the page."""
 
@@ -212,13 +223,17 @@ class Several(StageResult):
         return [section for part in self.parts for section in part.tables()]
 
 
-def merge(record: dict[str, Any], part: Mapping[str, Any]) -> None:
-    """Put a part of what run.json holds into the whole: checks and stage errors beside those that are there."""
+def merge(record: dict[str, Any], part: Mapping[str, Any], name: str = "") -> None:
+    """Put a part of what run.json holds into the whole: checks and stage errors beside those that are there.
+
+    A name that is taken is written as "STAGE.NAME": nothing that is there is lost, nor what the stage found.
+    """
     for key, value in part.items():
         if key in ("checks", "stage_errors"):
-            record.setdefault(key, {}).update(value)
+            inside = record.setdefault(key, {})
+            inside.update({(f"{name}.{k}" if k in inside else k): v for k, v in value.items()})
         else:
-            record[key] = value
+            record[f"{name}.{key}" if key in record else key] = value
 
 
 def in_order(stages: Mapping[str, Stage]) -> dict[str, Stage]:

@@ -147,3 +147,12 @@ def test_a_plan_says_that_errors_of_receivers_are_put_in_later():
     plan = file.plan(file.scene())
     assert ("receivers", "gain: put into the perfect blocks as they pass") in [item[:2] for item in plan.kept]
     assert "GainTerm" not in [item.name for item in plan.left_out]
+
+
+def test_a_record_never_takes_the_place_of_what_is_there():
+    from instrument.pipeline.stage import merge
+
+    record = {"seconds": {"predict": 1.0}, "checks": {"prediction": {"passed": False}}}
+    merge(record, {"seconds": 3, "mine": 1, "checks": {"prediction": {"passed": True}}}, "flagged")
+    assert record["seconds"] == {"predict": 1.0} and record["flagged.seconds"] == 3 and record["mine"] == 1
+    assert record["checks"] == {"prediction": {"passed": False}, "flagged.prediction": {"passed": True}}

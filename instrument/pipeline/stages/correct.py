@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import ClassVar, Literal
 
 from instrument.errors import unused
-from instrument.pipeline.stage import Running, Stage, StageRun
+from instrument.pipeline.stage import EachBlock, Running, Stage, StageRun
 from instrument.scene import Scene
-from instrument.visibilities import Visibilities
 
 
 class Correct(Stage):
@@ -27,13 +26,4 @@ class Correct(Stage):
 
     def start(self, run: Running) -> StageRun:
         """The stage at work."""
-        return _CorrectRun(run)
-
-
-class _CorrectRun(StageRun):
-    def __init__(self, run: Running) -> None:
-        self.run = run
-
-    def take(self, block: Visibilities) -> Visibilities:
-        """The block without the beam towards its centre."""
-        return block.without_beam(self.run.instrument)
+        return EachBlock(lambda block: block.without_beam(run.instrument))

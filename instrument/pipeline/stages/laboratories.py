@@ -86,15 +86,15 @@ class _Alone(StageRun):
 
 
 @dataclass(frozen=True)
-class SweepResult(StageResult):
-    """What calibrating on incomplete models did."""
+class _Found(StageResult):
+    """What a laboratory has found, told in its own words."""
 
-    sweep: Sweep
+    found: Any  # with `passed`, `lines()` and `write(folder)`
 
     @property
     def passed(self) -> bool:
         """Whether every solve converged."""
-        return self.sweep.passed
+        return bool(self.found.passed)
 
     def record(self) -> dict[str, Any]:
         """Whether every solve converged."""
@@ -102,12 +102,19 @@ class SweepResult(StageResult):
         return {"checks": {"solutions": {"outcome": [text], "passed": self.passed}}}
 
     def lines(self) -> list[str]:
-        """One line a model."""
-        return ["", *self.sweep.lines()]
+        """Those of what was found."""
+        return ["", *self.found.lines()]
 
     def write(self, folder: Path) -> None:
-        """Tables and images."""
-        self.sweep.write(folder)
+        """Its tables and images."""
+        self.found.write(folder)
+
+
+@dataclass(frozen=True)
+class SweepResult(_Found):
+    """What calibrating on incomplete models did."""
+
+    found: Sweep
 
     def sections(self, draw: Draw) -> list[Section]:
         """Errors against the size of the model."""
@@ -115,39 +122,21 @@ class SweepResult(StageResult):
         from instrument.report.spectra import spectra_2d
 
         text = "Errors against the number of sources in the model."
-        entries = [draw("errors_against_model", errors_against_model(self.sweep), text)]
-        if self.sweep.reference is not None:
-            made = self.sweep.spectra(taper="hann").items()
+        entries = [draw("errors_against_model", errors_against_model(self.found), text)]
+        if self.found.reference is not None:
+            made = self.found.spectra(taper="hann").items()
             curves = {f"left with {n} in the model" if n else "true image": curve for n, curve in made}
             text = "2D power spectra of the images, Hann taper; the PSF stays."
             entries.append(draw("spectrum_2d", spectra_2d(curves), text))
-        rows = Table.of(self.sweep.table(), "One row a model of the n brightest sources.")
+        rows = Table.of(self.found.table(), "One row a model of the n brightest sources.")
         return [Section("Incomplete models", [Figures(entries), rows])]
 
 
 @dataclass(frozen=True)
-class SubtractionResult(StageResult):
+class SubtractionResult(_Found):
     """What solving for many directions at once left."""
 
     found: ManyDirectionsResult
-
-    @property
-    def passed(self) -> bool:
-        """Whether every solve converged."""
-        return self.found.passed
-
-    def record(self) -> dict[str, Any]:
-        """Whether every solve converged."""
-        text = "all converged" if self.passed else "some intervals did not converge"
-        return {"checks": {"solutions": {"outcome": [text], "passed": self.passed}}}
-
-    def lines(self) -> list[str]:
-        """One line a cluster, and what is left."""
-        return ["", *self.found.lines()]
-
-    def write(self, folder: Path) -> None:
-        """The table."""
-        self.found.write(folder)
 
     def cards(self) -> list[Card]:
         """What is left, and how much more one direction for all leaves."""

@@ -8,9 +8,8 @@ from typing import Annotated, Any, Self
 from pydantic import Field
 
 from instrument.errors import InputError
-from instrument.pipeline.stage import Beside, Running, Stage, StageRun
+from instrument.pipeline.stage import Beside, EachBlock, Running, Stage, StageRun
 from instrument.units import Jansky, Seed
-from instrument.visibilities import Visibilities
 
 STEP = 3  # of the seeds of a scene
 
@@ -34,15 +33,6 @@ class Noise(Stage):
 
     def start(self, run: Running) -> StageRun:
         """The stage at work."""
-        return _NoiseRun(self)
-
-
-class _NoiseRun(StageRun):
-    def __init__(self, settings: Noise) -> None:
-        self.settings = settings
-
-    def take(self, block: Visibilities) -> Visibilities:
-        """The block with noise."""
         from astropy import units as u
 
-        return block.with_noise(self.settings.sefd * u.Jy, seed=self.settings.seed)
+        return EachBlock(lambda block: block.with_noise(self.sefd * u.Jy, seed=self.seed))
