@@ -65,7 +65,7 @@ def doctor(show: Callable[[str], None]) -> bool:
 
 def self_test() -> float:
     """Largest difference of the fast engine and the definition on problems of the contract, relative to the flux."""
-    from instrument.conformance_bench import problems
+    from instrument.conformance.bench import problems
     from instrument.predict.direct import Direct
     from instrument.predict.matrix import Matrix
 

@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from instrument.analyze.laboratory import IncompleteModel
-from instrument.analyze.sweep import ranks
+from instrument.experiments.incomplete_model import IncompleteModel
+from instrument.experiments.incomplete_model_result import ranks
 from instrument.pipeline.scene_file import parse
 from instrument.pipeline.scene_text import override, read_tables
 from instrument.report.laboratory import errors_against_model

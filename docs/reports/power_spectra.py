@@ -105,7 +105,7 @@ def ours_all(field):
 
 def box():
     """Lengths of the cube in Mpc, as ours takes them."""
-    from instrument.analyze.fourier import comoving, line_of_sight
+    from instrument.analyze.power.fourier import comoving, line_of_sight
 
     z, distance = comoving((FREQ[0] + FREQ[-1]) / 2, None, None)
     depth = line_of_sight(z, None) * (FREQ[1] - FREQ[0]) * len(FREQ)

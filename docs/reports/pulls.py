@@ -21,8 +21,8 @@ import numpy as np
 from astropy import units as u
 
 from instrument import Analyzer, PointSky, StokesCube, __version__
-from instrument.analyze.leakage import leakage_of
-from instrument.analyze.photometry import ForcedPhotometry
+from instrument.analyze.sources.leakage import leakage_of
+from instrument.analyze.sources.photometry import ForcedPhotometry
 from instrument.errors import InstrumentWarning
 from instrument.jones.mueller import brightness
 from instrument.observe.directions import lmn, offset
@@ -179,7 +179,7 @@ def _field(apart, wide=0.0, minutes=40):
 
 def sources(draws: int, seed: int = 0) -> list[Row]:
     """Fluxes and leakages by forced photometry, fluxes and positions by offsets, under noise of the receivers."""
-    from instrument.analyze.offsets import OffsetSums
+    from instrument.analyze.sources.offsets import OffsetSums
 
     rows: list[Row] = []
     for case, apart, wide, sefd, flagged in (

@@ -15,7 +15,7 @@ from astropy import units as u
 from leakage_cubes import leakage, observed, removers
 
 from instrument import InstrumentWarning, signal_loss
-from instrument.analyze.signal import Signal21cm
+from instrument.analyze.power.signal import Signal21cm
 
 HERE = Path(__file__).parent
 BANDS = ((0.0, 0.03), (0.03, 0.06), (0.06, 0.1), (0.1, 0.3), (0.3, 1.0))

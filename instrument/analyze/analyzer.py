@@ -6,16 +6,16 @@ import os
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from instrument.analyze.cells import Cells, cells_of
-from instrument.analyze.cylinders import Cylindrical, Spherical, cylindrical, spherical
-from instrument.analyze.faraday import Division, Precision, rm_synthesis
-from instrument.analyze.faraday_cube import FaradayCube
-from instrument.analyze.fourier import Stokes, Taper
-from instrument.analyze.leakage import Leakage, leakage_of
-from instrument.analyze.photometry import ForcedPhotometry, SourceFluxes
-from instrument.analyze.signal import Signal21cm
-from instrument.analyze.spectra import Spectrum2D, spectrum_2d
-from instrument.analyze.window import EoRWindow, eor_window
+from instrument.analyze.faraday.cube import FaradayCube
+from instrument.analyze.faraday.synthesis import Division, Precision, rm_synthesis
+from instrument.analyze.power.cells import Cells, cells_of
+from instrument.analyze.power.cylinders import Cylindrical, Spherical, cylindrical, spherical
+from instrument.analyze.power.fourier import Stokes, Taper
+from instrument.analyze.power.signal import Signal21cm
+from instrument.analyze.power.spectra import Spectrum2D, spectrum_2d
+from instrument.analyze.power.window import EoRWindow, eor_window
+from instrument.analyze.sources.leakage import Leakage, leakage_of
+from instrument.analyze.sources.photometry import ForcedPhotometry, SourceFluxes
 from instrument.checked import checked
 from instrument.errors import InputError
 from instrument.image.common_beam import say_unequal_beams

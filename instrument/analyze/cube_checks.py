@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from instrument.analyze.cells import Cells
-from instrument.analyze.faraday_cube import FaradayCube
-from instrument.analyze.fourier import taper_of
+from instrument.analyze.faraday.cube import FaradayCube
+from instrument.analyze.power.cells import Cells
+from instrument.analyze.power.fourier import taper_of
 from instrument.image.cube import StokesCube
 from instrument.units import Complex, Float
 

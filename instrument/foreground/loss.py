@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from instrument.analyze.analyzer import Analyzer
-from instrument.analyze.fourier import Taper
+from instrument.analyze.power.fourier import Taper
 from instrument.checked import checked
 from instrument.errors import InputError
 from instrument.foreground.base import ForegroundRemover

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from instrument.analyze.fourier import comoving, line_of_sight, taper_of
+from instrument.analyze.power.fourier import comoving, line_of_sight, taper_of
 from instrument.errors import InputError
 from instrument.foreground.linear import apply, covariance, one_thread
 from instrument.units import Bool, Float

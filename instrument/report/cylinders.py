@@ -19,9 +19,9 @@ from instrument.units import Float
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from instrument.analyze.cylinders import Cylindrical, Spherical
-    from instrument.analyze.signal import Signal21cm
-    from instrument.analyze.window import EoRWindow
+    from instrument.analyze.power.cylinders import Cylindrical, Spherical
+    from instrument.analyze.power.signal import Signal21cm
+    from instrument.analyze.power.window import EoRWindow
 
 WEDGES = (2.0, 10.0, 90.0)  # deg from the phase centre; the last is the horizon
 NO_DATA = "#bbbbbb"

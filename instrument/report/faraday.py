@@ -12,13 +12,13 @@ from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
-from instrument.analyze.faraday_band import number
+from instrument.analyze.faraday.band import number
 from instrument.errors import InputError
 from instrument.report.images import _prefix, _shrunk
 from instrument.report.style import BLUE, GREY, INK, ORANGE, axes_of, styled
 
 if TYPE_CHECKING:
-    from instrument.analyze.faraday_cube import FaradayCube
+    from instrument.analyze.faraday.cube import FaradayCube
 
 PHI = r"Faraday depth $\phi$ (rad m$^{-2}$)"
 HALO = [withStroke(linewidth=2.6, foreground="#333333")]  # white alone is lost on what is bright

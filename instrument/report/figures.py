@@ -21,7 +21,7 @@ from instrument.report.style import BLUE, GREY, INK, ORANGE, axes_of, styled
 from instrument.units import Direction, Float, unit_vectors
 
 if TYPE_CHECKING:
-    from instrument.analyze.leakage import Leakage
+    from instrument.analyze.sources.leakage import Leakage
 
 Kind = Literal["linear", "circular"]
 

@@ -11,7 +11,7 @@ from instrument.report.style import BLUE, GREY, INK, ORANGE, styled
 from instrument.units import Float
 
 if TYPE_CHECKING:
-    from instrument.analyze.sweep import Sweep
+    from instrument.experiments.incomplete_model_result import Sweep
 
 GREEN = "#009E73"  # Okabe & Ito
 

@@ -12,7 +12,7 @@ from instrument.errors import InputError
 from instrument.report.style import BLUE, GREY, INK, ORANGE, axes_of, styled
 
 if TYPE_CHECKING:
-    from instrument.analyze.spectra import Spectrum2D
+    from instrument.analyze.power.spectra import Spectrum2D
 
 # Okabe & Ito, and a marker each: told apart with every colour vision and without colour
 LOOKS = tuple(zip((BLUE, ORANGE, "#009E73", "#CC79A7", INK, GREY), "osD^vx", strict=True))

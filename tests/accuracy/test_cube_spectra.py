@@ -8,8 +8,8 @@ from astropy import units as u
 from astropy.cosmology import Planck15
 
 from instrument import Analyzer, InputError, StokesCube
-from instrument.analyze.cylinders import ratio
-from instrument.analyze.fourier import HYDROGEN, taper_of
+from instrument.analyze.power.cylinders import ratio
+from instrument.analyze.power.fourier import HYDROGEN, taper_of
 from instrument.image.cube import Psf
 from instrument.observe.directions import LIGHT
 

@@ -9,9 +9,9 @@ from astropy.cosmology import Planck18
 from astropy.io import fits
 
 from instrument import Analyzer, InputError, StokesCube
-from instrument.analyze.faraday_band import FaradayBand, depth_of_k_par, k_par_of_depth
-from instrument.analyze.faraday_product import Product
-from instrument.analyze.fourier import comoving, line_of_sight
+from instrument.analyze.faraday.band import FaradayBand, depth_of_k_par, k_par_of_depth
+from instrument.analyze.faraday.product import Product
+from instrument.analyze.power.fourier import comoving, line_of_sight
 from instrument.errors import InstrumentError, Outcome
 from instrument.observe.directions import LIGHT
 from instrument.units import Direction, UnitError
@@ -122,7 +122,7 @@ def test_a_pixel_is_the_same_in_any_image_and_any_chunk(monkeypatch):
     p = noise(rng, 33, 7, 411)
     p[5, 3, 100:300] = np.nan
     whole = Analyzer(polarized(p)).rm_synthesis(WIDE)
-    monkeypatch.setattr("instrument.analyze.faraday.CHUNK_BYTES", 0)  # 64 pixels at a time
+    monkeypatch.setattr("instrument.analyze.faraday.synthesis.CHUNK_BYTES", 0)  # 64 pixels at a time
     parts = Analyzer(polarized(p)).rm_synthesis(WIDE)
     assert worst(parts.data, whole.data) < 1e-14 and np.array_equal(parts.flags, whole.flags)
     turned = Analyzer(polarized(p.swapaxes(1, 2))).rm_synthesis(WIDE)

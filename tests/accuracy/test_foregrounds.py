@@ -15,7 +15,7 @@ from instrument_plugins.foregrounds.starlet import GAINS, SMOOTH, starlet, starl
 
 import instrument
 from instrument import Analyzer, InputError, Outcome, StokesCube, signal_loss
-from instrument.analyze.signal import Signal21cm
+from instrument.analyze.power.signal import Signal21cm
 from instrument.foreground.linear import covariance
 from instrument.foreground.score import noise_power
 from instrument.image.mocks import FINE, leaked, noise_cube, polarized_screens

@@ -8,9 +8,9 @@ from astropy.table import QTable
 
 import instrument
 from instrument import Imager, InputError, Observation, PointSky, Scene, SelfCal
-from instrument.analyze.laboratory import IncompleteModel
-from instrument.analyze.offsets import OffsetSums
-from instrument.analyze.sweep import ARCSEC, ranks
+from instrument.analyze.sources.offsets import OffsetSums
+from instrument.experiments.incomplete_model import IncompleteModel
+from instrument.experiments.incomplete_model_result import ARCSEC, ranks
 from instrument.report.laboratory import errors_against_model
 from instrument.report.style import save
 
@@ -118,14 +118,18 @@ def test_watched_sources_are_the_brightest_and_others_down_to_the_faintest():
 
 
 def test_a_sweep_in_pieces_is_the_sweep_at_once(sweep, monkeypatch):
-    monkeypatch.setattr("instrument.analyze.laboratory.BLOCK_BYTES", 64 * 91 * 3.0)  # three integrations at a time
+    monkeypatch.setattr(
+        "instrument.experiments.incomplete_model.BLOCK_BYTES", 64 * 91 * 3.0
+    )  # three integrations at a time
     pieces = IncompleteModel(models=(1, 10)).run(plan(field(), beam=None))
     assert pieces.visibility_share == pytest.approx(sweep.visibility_share[[0, 2]], rel=1e-4)  # solves stop at 1e-5
     assert pieces.change_jy == pytest.approx(sweep.change_jy[[0, 2]], abs=1e-3)
 
 
 def test_solutions_over_several_integrations_and_channels_and_every_second_integration_for_fluxes(monkeypatch):
-    monkeypatch.setattr("instrument.analyze.laboratory.BLOCK_BYTES", 64 * 91 * 2 * 6.5)  # 6 integrations at a time
+    monkeypatch.setattr(
+        "instrument.experiments.incomplete_model.BLOCK_BYTES", 64 * 91 * 2 * 6.5
+    )  # 6 integrations at a time
     where = plan(field(12), duration=8.5 * u.hour, frequencies=(149, 151), beam=None, gain=instrument.GainTerm(rms=0))
     found = IncompleteModel(models=(1, 12), selfcal=SelfCal(interval=1 * u.hour, channels=2), every=2).run(where)
     assert list(found.failed) == [0, 0] and 0.01 < found.visibility_share[0] < 0.1 and found.visibility_share[1] < 1e-9

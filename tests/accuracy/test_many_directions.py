@@ -8,8 +8,8 @@ from astropy.table import QTable
 
 import instrument
 from instrument import GainTerm, InputError, Observation, PointSky, Scene
-from instrument.analyze.many_directions import ManyDirections, cluster_of
 from instrument.calibrate.directional import DirectionalCal
+from instrument.experiments.many_directions import ManyDirections, cluster_of
 from instrument.pipeline.scene_file import parse
 from instrument.pipeline.scene_text import override, read_tables
 
@@ -81,7 +81,7 @@ def test_with_noise_what_is_left_is_due_and_one_direction_leaves_more(noisy):
 
 
 def test_pieces_are_the_whole(noisy, monkeypatch):
-    monkeypatch.setattr("instrument.analyze.many_directions.BLOCK_BYTES", 1.0)  # an interval at a time
+    monkeypatch.setattr("instrument.experiments.many_directions.BLOCK_BYTES", 1.0)  # an interval at a time
     done = []
     settings = ManyDirections(clusters=4, calibrator=MINUTE, sefd=2820 * u.Jy, seed=3)
     found = settings.run(plan(10), progress=done.append)

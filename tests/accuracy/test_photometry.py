@@ -9,8 +9,8 @@ from astropy.coordinates import SkyCoord
 
 import instrument
 from instrument import Analyzer, Observation, Outcome, PointSky, Scene, Towards
-from instrument.analyze.leakage import expected_percent
-from instrument.analyze.photometry import ForcedPhotometry
+from instrument.analyze.sources.leakage import expected_percent
+from instrument.analyze.sources.photometry import ForcedPhotometry
 
 CENTRE = SkyCoord("08h13m36.0s +48d13m03s")
 STATIONS = ["CS001HBA0", "CS003HBA1", "CS011HBA0", "CS101HBA0", "CS302HBA1", "RS106HBA", "RS205HBA", "RS508HBA"]

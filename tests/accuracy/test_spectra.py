@@ -9,8 +9,8 @@ from astropy.table import QTable
 
 import instrument
 from instrument import Analyzer, Imager, InputError, Observation, PointSky, Scene, StokesCube
-from instrument.analyze.fourier import bin_edges, bin_means, cell_variance, taper_of
-from instrument.analyze.spectra import ratio
+from instrument.analyze.power.fourier import bin_edges, bin_means, cell_variance, taper_of
+from instrument.analyze.power.spectra import ratio
 from instrument.errors import InstrumentWarning, UnitError
 from instrument.observe.directions import LIGHT
 from instrument.report.spectra import spectra_2d

@@ -23,11 +23,11 @@ from instrument import (
     StationBeam,
     Towards,
 )
-from instrument.analyze.many_directions import ManyDirections
 from instrument.component import Component
 from instrument.conformance import Report, check
-from instrument.conformance_bench import bench, hard_places, lofar_like, random_sky
+from instrument.conformance.bench import bench, hard_places, lofar_like, random_sky
 from instrument.errors import InputError, InstrumentError, Outcome
+from instrument.experiments.many_directions import ManyDirections
 from instrument.foreground.base import ForegroundRemover
 from instrument.foreground.linear import projection
 from instrument.jones.base import ElementBeam, JonesTerm

@@ -29,7 +29,7 @@ from instrument import (
     Scene,
     mueller,
 )
-from instrument.analyze.photometry import ForcedPhotometry
+from instrument.analyze.sources.photometry import ForcedPhotometry
 from instrument.cli import main
 from instrument.errors import InstrumentError, Outcome
 from instrument.jones.towards import Towards
@@ -264,7 +264,7 @@ def test_centre_that_goes_through_the_zenith_and_sets_is_corrected_while_up_and_
 
 
 def test_leakage_expected_of_a_centre_that_sets_is_the_mean_over_the_time_it_is_up():
-    from instrument.analyze.leakage import expected_percent
+    from instrument.analyze.sources.leakage import expected_percent
 
     array, centre = equator(), Direction(2.0, 0.0)
     at = plan(array, sky([[0.05, 0.02]], [[1, 0, 0, 0]], centre), observation(centre, 16, 60)).problem.at

@@ -9,7 +9,7 @@ import pytest
 from astropy import units as u
 
 from instrument import Analyzer, InputError, StokesCube
-from instrument.analyze.faraday_band import FaradayBand, depth_of_k_par, k_par_of_depth
+from instrument.analyze.faraday.band import FaradayBand, depth_of_k_par, k_par_of_depth
 from instrument.errors import UnitError
 from instrument.observe.directions import LIGHT
 

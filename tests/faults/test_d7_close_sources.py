@@ -7,8 +7,8 @@ from astropy.coordinates import SkyCoord
 
 import instrument
 from instrument import Analyzer, InputError, Observation, Outcome, PointSky, Scene
-from instrument.analyze.offsets import OffsetSums
-from instrument.analyze.photometry import ForcedPhotometry
+from instrument.analyze.sources.offsets import OffsetSums
+from instrument.analyze.sources.photometry import ForcedPhotometry
 
 CENTRE = SkyCoord("08h13m36.0s +48d13m03s")
 CORE = ["CS001HBA0", "CS002HBA0", "CS005HBA1", "CS011HBA0", "CS024HBA0", "CS028HBA1", "CS030HBA0", "CS103HBA1"]

@@ -7,7 +7,7 @@ import pytest
 from astropy import units as u
 
 from instrument import Analyzer, InputError, StokesCube
-from instrument.analyze.faraday_band import FaradayBand
+from instrument.analyze.faraday.band import FaradayBand
 from instrument.errors import InstrumentWarning
 
 WIDE = (800e6 + 9e6 * np.arange(33), 134e6 + 1e6 * np.arange(33))  # 800 to 1088 MHz, and the paper's 134 to 166 MHz

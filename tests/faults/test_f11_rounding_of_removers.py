@@ -174,7 +174,7 @@ def test_f14_a_score_that_is_not_known_is_not_called_held():
 
 
 def test_f11_the_gaussian_process_finds_noise_of_a_thousandth_of_the_foreground():
-    from instrument.conformance_foregrounds import foreground_cube
+    from instrument.conformance.foregrounds import foreground_cube
 
     # four smooth foregrounds of 1 K, 1 mK of noise: from one start it ended at 0.017 mK, or not, by the last bit
     found = load("gpr").split(foreground_cube()[0])

@@ -206,7 +206,7 @@ def case(name):
 
 def zenith():
     """The direction over the first station in the middle of the one integration."""
-    from instrument.conformance_bench import _icrs
+    from instrument.conformance.bench import _icrs
     from instrument.observe.directions import earth_frame
 
     stations = layout()

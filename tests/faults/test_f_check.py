@@ -13,7 +13,7 @@ from astropy.coordinates import SkyCoord
 import instrument
 from instrument import Composed, GainTerm, InputError, Layout, Observation, PointSky, Scene
 from instrument.check import Checker, definition
-from instrument.conformance_bench import problems
+from instrument.conformance.bench import problems
 from instrument.predict.direct import Direct
 
 REPORTS = Path(__file__).resolve().parents[2] / "docs" / "reports"

@@ -11,13 +11,13 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 import instrument
 from instrument import GainTerm, Observation, Scene, SelfCal
-from instrument.analyze import laboratory, many_directions
-from instrument.analyze.faraday_chunks import in_threads
-from instrument.analyze.laboratory import IncompleteModel
-from instrument.analyze.many_directions import ManyDirections
-from instrument.analyze.sweep import ranks
+from instrument.analyze.faraday.chunks import in_threads
 from instrument.calibrate import chunk
 from instrument.calibrate.directional import DirectionalCal
+from instrument.experiments import incomplete_model, many_directions
+from instrument.experiments.incomplete_model import IncompleteModel
+from instrument.experiments.incomplete_model_result import ranks
+from instrument.experiments.many_directions import ManyDirections
 
 assert scipy.linalg
 STATIONS = ["CS001HBA0", "CS002HBA0", "CS003HBA0", "CS004HBA0"]
@@ -51,7 +51,7 @@ def plan():
 
 def test_g7_blocks_of_the_laboratories_leave_the_threads_alone(plan, two):
     sky = plan.problem.sky.sources()
-    incomplete = laboratory._Job(IncompleteModel(models=(2, 4)), plan, sky, ranks(sky))
+    incomplete = incomplete_model._Job(IncompleteModel(models=(2, 4)), plan, sky, ranks(sky))
     settings = ManyDirections(clusters=2)
     many = many_directions._Job(settings, plan, sky, np.array([0, 0, 1, 1]))
     for job in (incomplete, many):

@@ -27,8 +27,8 @@ from instrument import (
     SelfCal,
     StokesCube,
 )  # fmt: skip
-from instrument.analyze.photometry import ForcedPhotometry
-from instrument.conformance_foregrounds import foreground_cube
+from instrument.analyze.sources.photometry import ForcedPhotometry
+from instrument.conformance.foregrounds import foreground_cube
 
 pytestmark = pytest.mark.rounding
 CENTRE = SkyCoord("08h13m36.0s +48d13m03s")

@@ -9,9 +9,9 @@ from astropy.io import fits
 from astropy.table import QTable
 
 from instrument import InputError, StokesCube
-from instrument.analyze.cells import cells_of
 from instrument.analyze.cube_checks import check_cells, check_faraday
-from instrument.analyze.faraday import rm_synthesis
+from instrument.analyze.faraday.synthesis import rm_synthesis
+from instrument.analyze.power.cells import cells_of
 from instrument.cli import main
 from instrument.image.cube import Psf
 from instrument.pipeline.stages.cube import CubeAnalysis

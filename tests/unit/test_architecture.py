@@ -43,16 +43,10 @@ LAYERS = (
     ("analyze",),
     ("foreground",),
     ("files",),
+    ("experiments",),
     ("report",),
     ("pipeline",),
-    (
-        "conformance",
-        "conformance_bench",
-        "conformance_terms",
-        "conformance_engines",
-        "conformance_foregrounds",
-        "conformance_stages",
-    ),
+    ("conformance",),
     ("doctor",),
     ("",),  # `instrument` itself, which looks names up in all of them when they are first used
     ("cli",),
@@ -128,9 +122,7 @@ def runs_back(found):
     (number, group), (other, imported_group) = layer(found.importer), layer(found.imported)
     if found.importer == "" and found.deferred:
         return False
-    # the modules of conformance are one thing in several files
-    one = group.split("_")[0] == imported_group.split("_")[0]
-    return not (other < number or (other == number and one))
+    return not (other < number or (other == number and group == imported_group))
 
 
 # Imports ---------------------------------------------------------------------------------------------------------

@@ -119,7 +119,7 @@ def test_a_plugin_that_raises_anything_on_import_does_not_break_the_rest(install
 def test_a_plan_with_a_broken_engine_names_it_and_runs_with_another(installed):
     from astropy import units as u
 
-    from instrument.conformance_bench import bench, lofar_like, random_sky
+    from instrument.conformance.bench import bench, lofar_like, random_sky
 
     installed(point("bad", "no_such_module_anywhere:X", "bad-package"), point("plain", GOOD, "one"))
     scene = instrument.Scene(

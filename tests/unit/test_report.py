@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from instrument import StokesCube
-from instrument.analyze.leakage import Leakage
+from instrument.analyze.sources.leakage import Leakage
 from instrument.errors import FileError, InputError
 from instrument.image.cube import Psf
 from instrument.observe.directions import offset

@@ -13,7 +13,7 @@ from astropy import units as u
 from astropy.table import QTable
 
 from instrument import InputError, Stage
-from instrument.analyze.photometry import ForcedPhotometry
+from instrument.analyze.sources.photometry import ForcedPhotometry
 from instrument.pipeline.run import run
 from instrument.pipeline.scene_file import parse
 from instrument.pipeline.scene_text import override, read_tables

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 
 from instrument.analyze.analyzer import Analyzer
-from instrument.analyze.photometry import ForcedPhotometry
-from instrument.analyze.spectra import Spectrum2D
+from instrument.analyze.power.spectra import Spectrum2D
+from instrument.analyze.sources.photometry import ForcedPhotometry
 from instrument.errors import InputError, unused
 from instrument.pipeline.stage import Beside, Draw, Running, Several, Stage, StageResult, StageRun
 from instrument.pipeline.stages.cube import CubeAnalysis

@@ -11,11 +11,11 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from instrument.analyze.analyzer import Analyzer
-from instrument.analyze.channel_grid import even_channels
 from instrument.analyze.cube_checks import check_cells, check_faraday
-from instrument.analyze.faraday_band import MOST, FaradayBand
-from instrument.analyze.fourier import Stokes, Taper
-from instrument.analyze.signal import DEFAULT, Signal21cm
+from instrument.analyze.faraday.band import MOST, FaradayBand
+from instrument.analyze.power.channel_grid import even_channels
+from instrument.analyze.power.fourier import Stokes, Taper
+from instrument.analyze.power.signal import DEFAULT, Signal21cm
 from instrument.checked import checked
 from instrument.component import Component
 from instrument.errors import InputError, InstrumentWarning, unused, warn

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from instrument.analyze.faraday_cube import FaradayCube
+from instrument.analyze.faraday.cube import FaradayCube
 from instrument.analyze.ixr import removal_table
-from instrument.analyze.signal import Signal21cm
+from instrument.analyze.power.signal import Signal21cm
 from instrument.pipeline.stage import Draw
 from instrument.pipeline.stages.cube_results import CubeResults
 from instrument.report.cylinders import cylinder, cylinder_ratio, spheres

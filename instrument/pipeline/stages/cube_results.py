@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from instrument.analyze.cube_checks import CubeCheck
-from instrument.analyze.cylinders import Cylindrical, Spherical
-from instrument.analyze.faraday_clean import FaradayClean
-from instrument.analyze.faraday_cube import FaradayCube
-from instrument.analyze.faraday_peaks import FaradayPeaks
-from instrument.analyze.spectra import Spectrum2D
-from instrument.analyze.window import EoRWindow
+from instrument.analyze.faraday.clean import FaradayClean
+from instrument.analyze.faraday.cube import FaradayCube
+from instrument.analyze.faraday.peaks import FaradayPeaks
+from instrument.analyze.power.cylinders import Cylindrical, Spherical
+from instrument.analyze.power.spectra import Spectrum2D
+from instrument.analyze.power.window import EoRWindow
 from instrument.errors import InputError, Outcome
 from instrument.foreground.base import Split
 from instrument.image.cube import StokesCube

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-from instrument.analyze.laboratory import IncompleteModel
-from instrument.analyze.many_directions import ManyDirections
-from instrument.analyze.subtraction import ManyDirectionsResult
-from instrument.analyze.sweep import Sweep
 from instrument.calibrate.directional import DirectionalCal
 from instrument.component import Component
+from instrument.experiments.incomplete_model import IncompleteModel
+from instrument.experiments.incomplete_model_result import Sweep
+from instrument.experiments.many_directions import ManyDirections
+from instrument.experiments.many_directions_result import ManyDirectionsResult
 from instrument.image.dirty import Imager
 from instrument.pipeline.stage import Beside, Draw, Running, Stage, StageResult, StageRun
 from instrument.pipeline.stages.noise import STEP, Noise

@@ -11,7 +11,7 @@ from instrument.units import Direction
 from instrument.whole_file import whole_file
 
 if TYPE_CHECKING:
-    from instrument.analyze.faraday_cube import FaradayCube
+    from instrument.analyze.faraday.cube import FaradayCube
 
 
 def sky_header(cube: FaradayCube) -> Any:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from instrument.analyze.channel_grid import even_channels, infill_operator, same_grid
-from instrument.analyze.fourier import (
+from instrument.analyze.power.channel_grid import even_channels, infill_operator, same_grid
+from instrument.analyze.power.fourier import (
     Stokes,
     Taper,
     check_redshift,
@@ -19,14 +19,14 @@ from instrument.analyze.fourier import (
     taper_of,
     uv_limits,
 )
-from instrument.analyze.modes import Modes
+from instrument.analyze.power.modes import Modes
 from instrument.errors import InputError, InstrumentWarning
 from instrument.image.cube import StokesCube
 from instrument.numbers import LARGEST, squarable
 from instrument.units import Bool, Complex, Float, Int, one_si
 
 if TYPE_CHECKING:
-    from instrument.analyze.cylinders import Cylindrical, Spherical
+    from instrument.analyze.power.cylinders import Cylindrical, Spherical
 
 BLOCK = 8  # channels transformed at once: 8 images of 480 x 480 are 15 MB
 COLUMNS = 512  # cells transformed along frequency at once: 1.3 MB of 161 channels stay in the cache
@@ -80,13 +80,13 @@ class Cells:
         self, bins: Any = 15, bins_par: Any = None, log: bool = True, paper_axis: bool = False
     ) -> Cylindrical:
         """Spectrum in bins of k_perp and k_par; see `Analyzer.cylindrical`."""
-        from instrument.analyze.cylinders import cylindrical
+        from instrument.analyze.power.cylinders import cylindrical
 
         return cylindrical(self, bins, bins_par, log, paper_axis)
 
     def spherical(self, bins: Any = 15, log: bool = True, wedge: Any = None, k_par_min: Any = None) -> Spherical:
         """Spectrum in bins of k; see `Analyzer.spherical`."""
-        from instrument.analyze.cylinders import spherical
+        from instrument.analyze.power.cylinders import spherical
 
         return spherical(self, bins, log, wedge, k_par_min)
 

@@ -13,9 +13,9 @@ from typing import Annotated
 
 import numpy as np
 
-from instrument.analyze.blanks import CHUNKS, FREE, PLACES, excess, places
-from instrument.analyze.patches import gathered, groups, mixture
-from instrument.analyze.told_apart import coincide, conjugate_gradients, positive_solve
+from instrument.analyze.sources.blanks import CHUNKS, FREE, PLACES, excess, places
+from instrument.analyze.sources.patches import gathered, groups, mixture
+from instrument.analyze.sources.told_apart import coincide, conjugate_gradients, positive_solve
 from instrument.component import Component
 from instrument.errors import InputError, Outcome
 from instrument.jones import mueller

@@ -17,13 +17,13 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, field_validator
 
-from instrument.analyze.offsets import OffsetSums
-from instrument.analyze.sweep import Sweep, find_ghosts, ranks
+from instrument.analyze.sources.offsets import OffsetSums
 from instrument.calibrate.base import Solution
 from instrument.calibrate.selfcal import SelfCal
 from instrument.checked import checked
 from instrument.component import Component
 from instrument.errors import InputError, Outcome
+from instrument.experiments.incomplete_model_result import Sweep, find_ghosts, ranks
 from instrument.image.cube import StokesCube
 from instrument.image.dirty import Imager, Images
 from instrument.jones.chain import Chain

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from instrument.analyze.faraday_band import FaradayBand, PerhapsNaN, number
+from instrument.analyze.faraday.band import FaradayBand, PerhapsNaN, number
 from instrument.checked import checked
 from instrument.observe.directions import LIGHT
 from instrument.units import Complex, Direction, Float
 
 if TYPE_CHECKING:
-    from instrument.analyze.faraday_clean import FaradayClean
-    from instrument.analyze.faraday_peaks import FaradayPeaks
+    from instrument.analyze.faraday.clean import FaradayClean
+    from instrument.analyze.faraday.peaks import FaradayPeaks
 
 
 @checked
@@ -122,13 +122,13 @@ class FaradayCube:
 
         See `FaradayClean`. Raises `InputError` for depths that are not evenly spaced.
         """
-        from instrument.analyze.faraday_clean import rm_clean
+        from instrument.analyze.faraday.clean import rm_clean
 
         return rm_clean(self, cutoff, sigmas, gain, iterations, progress)
 
     def peaks(self, snr: float = 8.0, noise: Any = None) -> FaradayPeaks:
         """Depth, polarized intensity and angle of the brightest peak of every pixel; see `FaradayPeaks`."""
-        from instrument.analyze.faraday_peaks import find_peaks
+        from instrument.analyze.faraday.peaks import find_peaks
 
         return find_peaks(self, snr, noise)
 
@@ -138,6 +138,6 @@ class FaradayCube:
         RMSF, CHANNELS and DEPTHS are tables; depths that are not evenly spaced are numbered on the axis and listed in
         the table only. The file is whole or not there.
         """
-        from instrument.analyze.faraday_file import write_faraday
+        from instrument.analyze.faraday.file import write_faraday
 
         write_faraday(self, path)

@@ -10,8 +10,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from instrument.analyze.cells import Cells, Frame
-from instrument.analyze.fourier import bin_edges, per_mpc, sine
+from instrument.analyze.power.cells import Cells, Frame
+from instrument.analyze.power.fourier import bin_edges, per_mpc, sine
 from instrument.checked import checked
 from instrument.errors import InputError
 from instrument.units import FINITE, Float, Int

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from instrument.analyze.leakage import NULL
-from instrument.analyze.spectra import Spectrum2D, spectrum_2d
+from instrument.analyze.power.spectra import Spectrum2D, spectrum_2d
+from instrument.analyze.sources.leakage import NULL
 from instrument.errors import InputError
 from instrument.image.cube import StokesCube
 from instrument.observe.directions import lmn, offset

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from instrument.conformance_bench import demand
+from instrument.conformance.bench import demand
 from instrument.image.dirty import Imager
 from instrument.jones.gain import GainTerm
 from instrument.model import Composed

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from instrument.analyze.fourier import comoving, line_of_sight, per_mpc
+from instrument.analyze.power.fourier import comoving, line_of_sight, per_mpc
 from instrument.checked import checked
 from instrument.errors import InputError, InstrumentWarning, did_you_mean
 from instrument.image.cube import StokesCube

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from instrument.analyze.faraday_aliases import sidelobe
-from instrument.analyze.faraday_band import number, one
-from instrument.analyze.faraday_chunks import in_threads
-from instrument.analyze.faraday_cube import FaradayCube
-from instrument.analyze.faraday_kernels import brightest, summit
+from instrument.analyze.faraday.aliases import sidelobe
+from instrument.analyze.faraday.band import number, one
+from instrument.analyze.faraday.chunks import in_threads
+from instrument.analyze.faraday.cube import FaradayCube
+from instrument.analyze.faraday.kernels import brightest, summit
 from instrument.errors import InputError
 from instrument.units import Bool, Float, Int
 from instrument.whole_file import whole_file
@@ -62,7 +62,7 @@ class FaradayPeaks:
         """Write the maps as images of a FITS file, with the coordinates of the cube; whole or not there."""
         from astropy.io import fits
 
-        from instrument.analyze.faraday_file import sky_header
+        from instrument.analyze.faraday.file import sky_header
 
         units = {"depth": "rad/m2", "depth_error": "rad/m2", "snr": "", "significant": "", "edge": "", "ambiguous": ""}
         hdus: list[Any] = [fits.PrimaryHDU()]

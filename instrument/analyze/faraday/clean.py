@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from instrument.analyze.faraday_band import half_height, one
-from instrument.analyze.faraday_chunks import in_threads
-from instrument.analyze.faraday_cube import FaradayCube
+from instrument.analyze.faraday.band import half_height, one
+from instrument.analyze.faraday.chunks import in_threads
+from instrument.analyze.faraday.cube import FaradayCube
 from instrument.compiled import compiled
 from instrument.errors import InputError, InstrumentError, Outcome
 from instrument.phasor import FAST

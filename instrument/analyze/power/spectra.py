@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from instrument.analyze.fourier import (
+from instrument.analyze.power.fourier import (
     Stokes,
     Taper,
     bin_edges,
@@ -22,7 +22,7 @@ from instrument.analyze.fourier import (
     taper_of,
     uv_limits,
 )
-from instrument.analyze.modes import independent, some
+from instrument.analyze.power.modes import independent, some
 from instrument.checked import checked
 from instrument.errors import InputError, InstrumentWarning
 from instrument.image.cube import StokesCube

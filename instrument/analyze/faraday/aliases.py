@@ -9,7 +9,7 @@ import numpy as np
 from instrument.units import Float, Int
 
 if TYPE_CHECKING:
-    from instrument.analyze.faraday_cube import FaradayCube
+    from instrument.analyze.faraday.cube import FaradayCube
 
 CHUNK_BYTES = 32 << 20
 MOST = 200_000  # steps of FWHM / 8 in which aliases are looked for

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from instrument.analyze.cylinders import Cylindrical, demand_same
-from instrument.analyze.fourier import per_mpc
-from instrument.analyze.signal import Signal21cm
+from instrument.analyze.power.cylinders import Cylindrical, demand_same
+from instrument.analyze.power.fourier import per_mpc
+from instrument.analyze.power.signal import Signal21cm
 from instrument.checked import checked
 from instrument.errors import InputError
 from instrument.units import FINITE, Bool, Float, Share

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from instrument.check import definition
-from instrument.conformance_bench import ROUNDING, demand, demand_repeatable, demand_same
+from instrument.conformance.bench import ROUNDING, demand, demand_repeatable, demand_same
 from instrument.predict.base import Predictor, Problem
 from instrument.predict.direct import Direct
 from instrument.units import Complex

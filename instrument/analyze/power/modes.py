@@ -11,7 +11,7 @@ import numpy as np
 from instrument.units import Float, Int
 
 if TYPE_CHECKING:
-    from instrument.analyze.cells import Cells
+    from instrument.analyze.power.cells import Cells
 
 NEAR = 6  # cells: the square of a four-term taper reaches no further
 LEAST = 1e-4  # of the correlation of a cell with itself: what is less counts with the far ones

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from instrument.conformance_bench import demand, demand_repeatable, demand_same
+from instrument.conformance.bench import demand, demand_repeatable, demand_same
 from instrument.errors import Outcome
 from instrument.foreground.base import ForegroundRemover
 from instrument.image.cube import StokesCube

@@ -8,13 +8,13 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from instrument.analyze.faraday_band import FaradayBand, number, one
-from instrument.analyze.faraday_chunks import allocated, in_threads
-from instrument.analyze.faraday_cube import FaradayCube
-from instrument.analyze.faraday_kernels import combine, combine_real, divide, gather, has_data, mark
-from instrument.analyze.faraday_noise import channel_noise
-from instrument.analyze.faraday_product import Product
-from instrument.analyze.fourier import Stokes
+from instrument.analyze.faraday.band import FaradayBand, number, one
+from instrument.analyze.faraday.chunks import allocated, in_threads
+from instrument.analyze.faraday.cube import FaradayCube
+from instrument.analyze.faraday.kernels import combine, combine_real, divide, gather, has_data, mark
+from instrument.analyze.faraday.noise import channel_noise
+from instrument.analyze.faraday.product import Product
+from instrument.analyze.power.fourier import Stokes
 from instrument.errors import InputError, did_you_mean, warn
 from instrument.image.cube import StokesCube
 from instrument.memory import afford

@@ -13,13 +13,13 @@ import numpy as np
 from pydantic import Field
 
 from instrument import mat2
-from instrument.analyze.subtraction import ManyDirectionsResult
-from instrument.analyze.sweep import ranks
 from instrument.calibrate.directional import DirectionalCal
 from instrument.calibrate.gauge import UNKNOWNS
 from instrument.calibrate.selfcal import SelfCal
 from instrument.component import Component
 from instrument.errors import InputError, Outcome, did_you_mean
+from instrument.experiments.incomplete_model_result import ranks
+from instrument.experiments.many_directions_result import ManyDirectionsResult
 from instrument.jones.chain import Chain
 from instrument.jones.table import JonesTable
 from instrument.observe.sampling import Sampling

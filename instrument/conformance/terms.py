@@ -10,7 +10,7 @@ from typing import get_args
 import numpy as np
 
 from instrument import mat2
-from instrument.conformance_bench import (
+from instrument.conformance.bench import (
     ROUNDING,
     Broken,
     cuts,

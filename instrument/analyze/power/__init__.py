@@ -1,0 +1,1 @@
+"""Power spectra: Fourier cells, bins, spectra of images and cubes, the EoR window."""

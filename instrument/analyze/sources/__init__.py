@@ -1,0 +1,1 @@
+"""Sources: their fluxes and positions out of visibilities, and the leakage that they show."""

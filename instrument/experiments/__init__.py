@@ -1,0 +1,1 @@
+"""Experiments: a scene predicted, corrupted and solved many times, and what that tells."""
