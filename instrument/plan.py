@@ -17,7 +17,8 @@ from instrument.predict.base import Predictor, Problem, Work
 from instrument.predict.direct import Direct
 from instrument.predict.threads import look_again, predict
 from instrument.units import si_prefix
-from instrument.visibilities import BeamState, Visibilities
+from instrument.visibilities import BeamState, Visibilities, VisibilitySet
+from instrument.visibility_sets import as_set
 
 
 class Item(NamedTuple):
@@ -30,7 +31,7 @@ class Item(NamedTuple):
 
 @checked
 @dataclass(frozen=True)
-class Plan:
+class Plan(VisibilitySet):
     """What will be done. Print it; `run` it at once or take `blocks` one by one; `verify` it against the definition."""
 
     name: str
@@ -191,7 +192,7 @@ class Plan:
         return not_checked("nobody looked at the blocks", self.sum_bound, self.scale_jy)
 
     def verify(
-        self, vis: Visibilities | Iterable[Visibilities] | None = None, samples: int = 64, seed: int = 0
+        self, vis: VisibilitySet | Iterable[Visibilities] | None = None, samples: int = 64, seed: int = 0
     ) -> Check:
         """Hold what was produced, `vis` (visibilities or blocks of them), against the definition of the scene as given.
 
@@ -201,7 +202,7 @@ class Plan:
         """
         checker = self._checker(samples, seed)
         if vis is not None:
-            return watch(checker, [vis] if isinstance(vis, Visibilities) else vis)
+            return watch(checker, as_set(vis).blocks())
         cells = (self.problem.block(slice(t, t + 1), slice(f, f + 1)) for t, f in checker.chosen())
         return watch(checker, (predict(self.engine, cell) for cell in cells))
 

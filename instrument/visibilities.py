@@ -1,16 +1,19 @@
-"""Visibilities: data of all baselines with their coordinates, weights, flags, and which beam has been taken out."""
+"""Visibilities: data of all baselines with their coordinates, weights, flags and beam; and sets of blocks of them."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from instrument import mat2
+from instrument.beam_state import BeamState as BeamState
 from instrument.checked import checked
-from instrument.errors import BeamStateError, InputError, warn
+from instrument.errors import BeamStateError, InputError
 from instrument.jones import mueller
 from instrument.jones.base import JonesTerm
 from instrument.jones.chain import Chain
@@ -18,52 +21,30 @@ from instrument.jones.gain import exact_key, slot_normals
 from instrument.jones.towards import Towards, towards_in
 from instrument.model import Instrument
 from instrument.numbers import LARGEST
+from instrument.observe.closure import stations_of
 from instrument.observe.layout import Layout
 from instrument.observe.sampling import Sampling
-from instrument.units import POSITIVE, SEED, Bool, Complex, Direction, Float, Int, one_si, plain
+from instrument.units import SEED, Bool, Complex, Direction, Float, Int, one_si, plain
+from instrument.visibility_checks import check_baselines, check_weights, positive_along
 
 CANCELS = 1e6  # of a Jones matrix: its inverse twice in double precision leaves 1e-4
 
 
-@checked
-@dataclass(frozen=True)
-class BeamState:
-    """What has been taken out of visibilities: "nothing" or "centre" (the beam), and towards where.
+class VisibilitySet(ABC):
+    """Visibilities as blocks that can be gone through as often as needed: a plan, a file, a list, one `Visibilities`.
 
-    `beams` is the part of the chain in the data that differs between directions; `None` where nobody knows it (data
-    from elsewhere). `other` says that it was another beam that has been taken out.
+    Blocks hold all baselines and some times and channels, each of them once.
     """
 
-    removed: Literal["nothing", "centre"] = "nothing"
-    towards: Direction | None = None
-    beams: Chain | None = field(default=None, compare=False)
-    other: bool = False
+    @abstractmethod
+    def blocks(self) -> Iterator[Visibilities]:
+        """The blocks, in order of time; every call begins anew."""
 
-    def __str__(self) -> str:
-        if self.removed == "centre":
-            which = "another beam" if self.other else "differential beam"
-            return f"{which}, removed towards {self.towards}"
-        return "no beam" if self.beams is not None and not self.beams.terms else "absolute beam"
-
-    def without(self, beam: Towards, centre: Direction) -> BeamState:
-        """The state after a beam is taken out; raises `BeamStateError` where it cannot be in the data (any more)."""
-        if self.removed != "nothing":
-            raise BeamStateError(f"a beam has been taken out already ({self}): start from uncorrected visibilities")
-        taken = beam.chain.beams()
-        if self.beams is not None and taken.terms and not self.beams.terms:
-            raise BeamStateError("there is no beam in these visibilities (beam=None): there is none to take out")
-        other = self.beams is not None and taken != self.beams
-        if other:
-            warn("the beam that is taken out is not the beam that is in the data: their ratio is left at the centre")
-        return BeamState("centre", beam.direction or centre, self.beams, other)
-
-    def with_beam(self, beam: Towards) -> BeamState:
-        """The state after the beam at one direction is put on; raises `BeamStateError` where one is there."""
-        if self.removed == "centre":
-            return BeamState(beams=self.beams)
-        if self.beams is not None and self.beams.terms and beam.chain.beams().terms:
-            raise BeamStateError("a beam is in the data already: it would be there twice")
-        return BeamState(beams=beam.chain.beams())
+    def coverage(self) -> Iterator[Visibilities]:
+        """Coordinates and weights of the blocks with data of zero; what is flagged or not finite weighs nothing."""
+        for block in self.blocks():
+            zeros = np.broadcast_to(np.zeros((), complex), block.data.shape)
+            yield replace(block, data=zeros, weight=block.effective_weight)
 
 
 def _ones() -> Float:
@@ -76,22 +57,25 @@ def _no_flags() -> Bool:
 
 @checked
 @dataclass(frozen=True, eq=False)
-class Visibilities:
+class Visibilities(VisibilitySet):
     """Visibilities in Jy, complex (T, F, B, 2, 2): rows are receptors p, q of the first station, columns of the second.
 
     `at` holds times, channels, stations and the phase centre; `weight` (finite, not negative) and `flag` (bool) are
-    (T, F, B), length 1 where constant. Nothing is changed in place: every method returns a new object.
+    (T, F, B), length 1 where constant. `interval_s` (T,) and `width_hz` (F,) are one number where all are alike.
+    `given_uvw_m` (T, B, 3), m, station 1 minus station 2, are the UVW of a file; without it they are worked out.
+    Nothing is changed in place: every method returns a new object.
     """
 
     data: Complex
     at: Sampling
     antenna1: Int
     antenna2: Int
-    interval_s: float
-    width_hz: float | None = None
+    interval_s: Float | float  # kept as (T | 1,)
+    width_hz: Float | float | None = None  # kept as (F | 1,)
     weight: Float = field(default_factory=_ones)
     flag: Bool = field(default_factory=_no_flags)
-    beam_state: BeamState = BeamState()
+    beam_state: BeamState = field(default_factory=BeamState)
+    given_uvw_m: Float | None = None
 
     def __post_init__(self) -> None:
         self._as_the_kernels_take_them()
@@ -99,43 +83,23 @@ class Visibilities:
         want = (times, channels, len(self.antenna1), 2, 2)
         if self.data.shape != want:
             raise InputError(f"data has shape {self.data.shape}, the coordinates need {want}")
-        POSITIVE.check(self.interval_s, "interval_s")
-        if self.width_hz is not None:
-            POSITIVE.check(self.width_hz, "width_hz")
-        for name in ("antenna1", "antenna2"):
-            stations = getattr(self, name)
-            if stations.dtype.kind not in "iu" or np.any((stations < 0) | (stations >= len(self.layout))):
-                raise InputError(f"{name} must hold numbers of stations, 0 to {len(self.layout) - 1}")
-        self._check_baselines()
-        for name in ("weight", "flag"):
-            shape = getattr(self, name).shape
-            if len(shape) != 3 or any(n not in (1, m) for n, m in zip(shape, want, strict=False)):
-                raise InputError(f"{name} has shape {shape}, needed {want[:3]} with length 1 where constant")
-        if self.flag.dtype.kind != "b":
-            raise InputError(f"flag holds {self.flag.dtype}, needed bool")
-        if self.weight.dtype.kind not in "fiu" or not np.all(np.isfinite(self.weight)) or np.any(self.weight < 0):
-            raise InputError("weight must be finite and not negative: flag what does not count")
-        beyond = self.weight[(self.weight > 0) & ((self.weight < 1 / LARGEST) | (self.weight > LARGEST))]
-        if beyond.size:
-            raise InputError(f"weight = {beyond[0]:g} is beyond what squares can hold: scale all of them")
+        for name, count in (("interval_s", times), ("width_hz", channels)):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, positive_along(getattr(self, name), count, name))
+        check_baselines(self.antenna1, self.antenna2, self.layout.names)
+        check_weights(self.weight, self.flag, want[:3])
+        if (uvw := self.given_uvw_m) is not None and (uvw.shape != (times, want[2], 3) or not np.isfinite(uvw).all()):
+            raise InputError(f"given_uvw_m has shape {uvw.shape}, needed {(times, want[2], 3)}, all finite")
 
     def _as_the_kernels_take_them(self) -> None:
         """Numbers of any precision and byte order in double precision and the machine's own order."""
-        for name, kind in (("data", complex), ("weight", float), ("antenna1", int), ("antenna2", int)):
+        kinds = (("data", complex), ("weight", float), ("antenna1", int), ("antenna2", int), ("given_uvw_m", float))
+        for name, kind in kinds:
             given = getattr(self, name)
-            if given.dtype.kind in "fiuc" and given.dtype != kind and not (kind is int and given.dtype.kind == "f"):
+            if given is None or given.dtype == kind or given.dtype.kind not in "fiuc":
+                continue
+            if kind is not int or given.dtype.kind != "f":  # 1.5 is no number of a station
                 object.__setattr__(self, name, given.astype(kind))
-
-    def _check_baselines(self) -> None:
-        first, second, names = self.antenna1, self.antenna2, self.layout.names
-        if first.shape != second.shape:
-            raise InputError(f"antenna1 has {len(first)} baselines, antenna2 {len(second)}")
-        if (alone := np.flatnonzero(first == second)).size:
-            raise InputError(f"baseline {alone[0]} is of station '{names[first[alone[0]]]}' with itself: leave it out")
-        pairs, count = np.unique(np.minimum(first, second) * len(names) + np.maximum(first, second), return_counts=True)
-        if len(pairs) < len(first):
-            a, b = divmod(int(pairs[count.argmax()]), len(names))
-            raise InputError(f"baseline {names[a]}-{names[b]} is there twice: leave one out")
 
     def __repr__(self) -> str:
         times, channels, baselines = self.data.shape[:3]
@@ -166,11 +130,48 @@ class Visibilities:
 
         return Time(self.at.slots_s // 86400, (self.at.slots_s % 86400) / 86400, format="mjd", scale="utc")
 
+    @property
+    def integration_s(self) -> float:
+        """Length of an integration in s, of the longest where they differ: the grid of times that solvers use."""
+        return float(np.max(self.interval_s))
+
     @cached_property
     def uvw_m(self) -> Float:
-        """Baselines u, v, w in m (T, B, 3): station 1 minus station 2."""
+        """Baselines u, v, w in m (T, B, 3): station 1 minus station 2; those given, or those of the coordinates."""
+        if self.given_uvw_m is not None:
+            return self.given_uvw_m
         stations = self.at.uvw_m
         return stations[:, self.antenna1] - stations[:, self.antenna2]
+
+    @cached_property
+    def station_uvw_m(self) -> Float:
+        """Stations u, v, w in m (T, A, 3), whose differences are `uvw_m`; raises `InputError` where there are none."""
+        if self.given_uvw_m is None:
+            return self.at.uvw_m
+        return stations_of(self.given_uvw_m, self.antenna1, self.antenna2, len(self.layout))
+
+    def blocks(self) -> Iterator[Visibilities]:
+        """One block: these."""
+        yield self
+
+    def block(self, times: slice, channels: slice) -> Visibilities:
+        """The same for some times and channels."""
+
+        def cut(array: Any) -> Any:
+            steps = zip(array.shape, (times, channels), strict=False)
+            return array[tuple(slice(None) if n == 1 else step for n, step in steps)]
+
+        uvw, width, interval = self.given_uvw_m, self.width_hz, self.interval_s
+        return replace(
+            self,
+            data=self.data[times, channels],
+            at=self.at.block(times, channels),
+            interval_s=interval[times] if np.size(interval) > 1 else interval,  # type: ignore[index]
+            width_hz=width[channels] if width is not None and np.size(width) > 1 else width,  # type: ignore[index]
+            weight=cut(self.weight),
+            flag=cut(self.flag),
+            given_uvw_m=None if uvw is None else uvw[times],
+        )
 
     @property
     def effective_weight(self) -> Float:
@@ -196,27 +197,32 @@ class Visibilities:
         """Stokes visibilities I, Q, U, V in Jy, complex (T, F, B, 4): I = (pp+qq)/2 and so on."""
         return mueller.stokes(self.data)
 
-    def noise_jy(self, sefd: Any) -> float:
-        """Rms of the noise in the real or imaginary part of one correlation: SEFD / sqrt(2 dnu dt), in Jy."""
+    def noise_jy(self, sefd: Any) -> Any:
+        """Rms of the noise in the real or imaginary part of one correlation: SEFD / sqrt(2 dnu dt), in Jy.
+
+        One number, or (T | 1, F | 1) where integrations or channels differ.
+        """
         value = one_si(sefd, "Jy", "sefd", at_least=0)
         if self.width_hz is None:
             raise InputError(
                 "noise needs the width of a channel, which one channel and channels apart do not tell: give "
                 "channel_width to the Observation"
             )
-        return value / float(np.sqrt(2 * self.width_hz * self.interval_s))
+        sigma = value / np.sqrt(2 * np.asarray(self.width_hz) * np.asarray(self.interval_s)[:, None])
+        return float(sigma[0, 0]) if sigma.size == 1 else sigma
 
     def with_noise(self, sefd: Any, seed: int) -> Visibilities:
         """The same with thermal noise of stations of one system equivalent flux density added.
 
         The noise of an integration and channel depends on seed, time and frequency only, not on the blocks of a run.
         """
-        seed, sigma = SEED.check(seed, "seed"), self.noise_jy(sefd)
+        seed, sigma = SEED.check(seed, "seed"), np.broadcast_to(self.noise_jy(sefd), self.data.shape[:2])
         noisy = np.array(self.data)
         count = len(self.antenna1)
         for i, freq in enumerate(self.freq_hz):
             # slot_normals has unit power over both parts, so each part has 1/2
-            noisy[:, i] += np.sqrt(2) * sigma * slot_normals((seed, exact_key(freq)), self.at.slots_s, (count, 2, 2))
+            drawn = slot_normals((seed, exact_key(freq)), self.at.slots_s, (count, 2, 2))
+            noisy[:, i] += np.sqrt(2) * sigma[:, i, None, None, None] * drawn
         return replace(self, data=noisy)
 
     def corrected(self, term: JonesTerm | Chain) -> Visibilities:
@@ -275,6 +281,7 @@ class Visibilities:
             and np.array_equal(self.antenna2, other.antenna2)
             and np.array_equal(self.at.slots_s, other.at.slots_s)
             and np.array_equal(self.freq_hz, other.freq_hz)
+            and (self.given_uvw_m is other.given_uvw_m or np.array_equal(self.uvw_m, other.uvw_m))
         )
         if not same:
             raise InputError("visibilities of other times, channels, stations or phase centres cannot be subtracted")

@@ -22,7 +22,7 @@ from instrument.image.common_beam import say_unequal_beams
 from instrument.image.cube import StokesCube
 from instrument.sky.base import Sky
 from instrument.units import Direction, Index
-from instrument.visibilities import Visibilities
+from instrument.visibilities import Visibilities, VisibilitySet
 
 
 @checked
@@ -35,7 +35,7 @@ class Analyzer:
     def __init__(
         self,
         cube: StokesCube | None = None,
-        visibilities: Visibilities | Iterable[Visibilities] | None = None,
+        visibilities: VisibilitySet | Iterable[Visibilities] | None = None,
         sky: Sky | None = None,
         fluxes: SourceFluxes | None = None,
         centre: Direction | None = None,

@@ -176,12 +176,10 @@ class _Grid:
         slots = data.at.slots_s
         if np.any(np.diff(slots) <= 0) or np.any(np.diff(data.at.freq_hz) <= 0):
             raise InputError("a solve needs times and channels in ascending order")
-        if not data.interval_s > 0:
-            raise InputError(f"the integrations of the data last {data.interval_s} s: they must be positive")
-        number = np.round((slots - slots[0]) / data.interval_s).astype(int)
+        number = np.round((slots - slots[0]) / data.integration_s).astype(int)
         span = int(number[-1]) + 1
-        steps = [1 if s is None else min(span, max(1, round(s / data.interval_s))) for s in seconds]
-        return cls(number, steps, math.lcm(*steps), math.gcd(*steps), float(slots[0]), data.interval_s)
+        steps = [1 if s is None else min(span, max(1, round(s / data.integration_s))) for s in seconds]
+        return cls(number, steps, math.lcm(*steps), math.gcd(*steps), float(slots[0]), data.integration_s)
 
     @property
     def blocks(self) -> Int:
@@ -306,7 +304,7 @@ class _Job:
             residual=share,
             gauge=gauge_of(self.models[cluster], self.weight, settings.pattern),
             history=history,
-            interval_s=self.grid.steps[cluster] * data.interval_s,
+            interval_s=self.grid.steps[cluster] * data.integration_s,
             suspects=suspects,
             spoilt=by_baseline(suspects, data),
             unexplained=share,

@@ -47,7 +47,7 @@ class SelfCal(Calibrator):
         """Solve every interval. Flagged and non-finite data weigh nothing; raises only when the two do not pair."""
         v, m, weight = pair(data, model)
         weight = self._cut(data, weight)
-        grouped = intervals(data.at.slots_s, self.interval, data.interval_s)
+        grouped = intervals(data.at.slots_s, self.interval, data.integration_s)
         channels = self._channels(data)
         cells = [(t, f) for t in grouped.slices for f in channels]
         chunks = [cells[i : i + LANES] for i in range(0, len(cells), LANES)]

@@ -281,10 +281,4 @@ class _Job:
 
 def _chosen(block: Visibilities, times: slice) -> Visibilities:
     """Some of the integrations."""
-    return replace(
-        block,
-        data=block.data[times],
-        at=block.at.block(times, slice(None)),
-        weight=block.weight[times] if len(block.weight) > 1 else block.weight,
-        flag=block.flag[times] if len(block.flag) > 1 else block.flag,
-    )
+    return block.block(times, slice(None))

@@ -16,7 +16,8 @@ from instrument.image.psf import fit_psf
 from instrument.image.weights import Density, Weighting
 from instrument.observe.directions import LIGHT
 from instrument.units import Complex, Float, Radians
-from instrument.visibilities import Visibilities
+from instrument.visibilities import Visibilities, VisibilitySet
+from instrument.visibility_sets import as_set
 
 HELD = 1_000_000  # visibilities gridded at once: bounds memory (90 MB) and keeps the fixed cost of a call small
 
@@ -60,24 +61,20 @@ class Imager(Component):
             raise InputError(f"uv_range = {value} must be two numbers of wavelengths, the smaller one first")
         return value
 
-    def image(self, visibilities: Visibilities | Iterable[Visibilities]) -> StokesCube:
+    def image(self, visibilities: VisibilitySet | Iterable[Visibilities]) -> StokesCube:
         """Dirty images in Jy/beam (F, 4, N, N) with their PSF, of visibilities or of blocks of them.
 
         Blocks must cover channels one after the other or all at once. Weights other than natural go over the blocks
         twice, so an iterator that can be read only once is refused.
         """
-        blocks = [visibilities] if isinstance(visibilities, Visibilities) else visibilities
-        density = None
-        if self.weighting != "natural":
-            if iter(blocks) is blocks:
-                raise InputError(f"{self.weighting} weights go over the visibilities twice: give a list of blocks")
-            density = self.density(blocks)
-        total = self.start(density)
-        for block in blocks:
+        natural = self.weighting == "natural"
+        given = as_set(visibilities, twice="" if natural else f"{self.weighting} weights")
+        total = self.start(None if natural else self.density(given.coverage()))
+        for block in given.blocks():
             total.add(block)
         return total.finish()
 
-    def psf(self, visibilities: Visibilities | Iterable[Visibilities]) -> Psf:
+    def psf(self, visibilities: VisibilitySet | Iterable[Visibilities]) -> Psf:
         """The point spread function alone, peak 1."""
         found = self.image(visibilities).psf
         assert found is not None

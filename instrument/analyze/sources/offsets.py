@@ -42,7 +42,7 @@ class OffsetSums:
             self.right = np.zeros((len(self.normal), len(stokes_i)))
         for t in range(block.at.shape[0]):
             for f, freq in enumerate(block.freq_hz):
-                uvw = block.at.uvw_m[t] * (freq / LIGHT)
+                uvw = block.station_uvw_m[t] * (freq / LIGHT)
                 apart = uvw[block.antenna1] - uvw[block.antenna2]
                 use = weights[t, f] > 0
                 if self.uv_range is not None:

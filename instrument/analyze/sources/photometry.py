@@ -1,8 +1,7 @@
 """Forced photometry: Stokes fluxes at known positions, solved together with the PSF between them, from visibilities.
 
-The flux of every source is the least-squares answer of V_ab = sum_s f_s K_ab(s): b = A^H W V is the adjoint sum at the
-positions, A^H W A the PSF between them. No image is made, so there is no limit to the field, and the sidelobes of a
-100 Jy source do not drown its neighbours of 0.4 Jy.
+The fluxes are the least-squares answer of V_ab = sum_s f_s K_ab(s): b = A^H W V is the adjoint sum at the positions,
+A^H W A the PSF between them. No image is made: the field has no limit, and a source of 100 Jy drowns none of 0.4 Jy.
 """
 
 from __future__ import annotations
@@ -23,7 +22,8 @@ from instrument.observe.directions import LIGHT, lmn
 from instrument.phasor import station_phases
 from instrument.sky.points import PointSky
 from instrument.units import Complex, Count, Float, Int, Real, UvRange, unit_vectors
-from instrument.visibilities import Visibilities
+from instrument.visibilities import Visibilities, VisibilitySet
+from instrument.visibility_sets import as_set
 
 MOST_DIRECT = 6000  # sources up to which the PSF matrix (300 MB) is formed; above, conjugate gradients
 ROWS = 512  # of that matrix at a time
@@ -68,10 +68,10 @@ class ForcedPhotometry(Component):
     accuracy: Annotated[float, Real(above=0, below=1)] = 1e-10
     iterations: Count = 200
 
-    def measure(self, visibilities: Visibilities | Iterable[Visibilities], sky: PointSky) -> SourceFluxes:
+    def measure(self, visibilities: VisibilitySet | Iterable[Visibilities], sky: PointSky) -> SourceFluxes:
         """Fluxes of the sources of `sky` in visibilities, or in blocks of them."""
         total = self.start(sky)
-        for block in [visibilities] if isinstance(visibilities, Visibilities) else visibilities:
+        for block in as_set(visibilities).blocks():
             total.add(block)
         return total.finish()
 
@@ -154,7 +154,7 @@ class PhotometrySums:
                 self.channels[float(freq)] = _Channel(np.zeros((len(self.first), 4)), mix)
             channel = self.channels[float(freq)]
             for t in range(-channel.seen % self.settings.every, at.shape[0], self.settings.every):
-                uvw = at.uvw_m[t] * (freq / LIGHT)
+                uvw = block.station_uvw_m[t] * (freq / LIGHT)
                 cut = self._inside(uvw, block)
                 weight = weights[t, f] if cut is None else weights[t, f] * cut
                 if not weight.any():

@@ -1,0 +1,30 @@
+"""Closure: coordinates of stations from those of their baselines, where these close around triangles."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from instrument.errors import InputError
+from instrument.units import Float, Int
+
+CLOSURE_M = 1e-6  # 3e-6 rad of phase at 150 MHz
+
+
+def stations_of(uvw_m: Float, antenna1: Int, antenna2: Int, count: int) -> Float:
+    """Stations (T, A, 3), m, whose differences, first minus second, are the baselines `uvw_m` (T, B, 3).
+
+    Raises `InputError` where no stations have these: baselines averaged over times of their own do not close.
+    """
+    graph, right = np.zeros((count, count)), np.zeros((count, len(uvw_m), 3))
+    for one, sign in ((antenna1, 1.0), (antenna2, -1.0)):
+        np.add.at(graph, (one, one), 1.0)
+        np.add.at(right, one, sign * uvw_m.transpose(1, 0, 2))
+    graph[antenna1, antenna2] = graph[antenna2, antenna1] = -1.0
+    found = np.linalg.lstsq(graph, right.reshape(count, -1), rcond=None)[0].reshape(right.shape).transpose(1, 0, 2)
+    apart = float(np.abs(found[:, antenna1] - found[:, antenna2] - uvw_m).max(initial=0.0))
+    if apart > CLOSURE_M:
+        raise InputError(
+            f"the given UVW do not close around triangles of stations (by {apart:.2g} m): what works station by "
+            "station needs baselines of the same times"
+        )
+    return np.asarray(found)
