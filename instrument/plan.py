@@ -6,16 +6,17 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from instrument.check import BY_STATIONS, DEFINITION, SHARE, Check, Checker, not_checked, watch
 from instrument.checked import checked
-from instrument.errors import RefusedError
-from instrument.predict.base import Predictor, Problem, Work
+from instrument.errors import InputError, RefusedError
+from instrument.predict.base import Predictor, Prepared, Problem, Work
 from instrument.predict.direct import Direct
-from instrument.predict.threads import look_again, predict
+from instrument.predict.threads import alone, look_again
 from instrument.units import si_prefix
 from instrument.visibilities import BeamState, Visibilities, VisibilitySet
 from instrument.visibility_sets import as_set
@@ -42,6 +43,7 @@ class Plan(VisibilitySet):
     not_modelled: tuple[Item, ...]
     engine: Predictor
     engine_name: str
+    engine_tolerance: float  # that the engine was prepared with
     refused: tuple[Item, ...]
     work: Work
     block_shape: tuple[int, int]
@@ -67,11 +69,19 @@ class Plan(VisibilitySet):
         """
         return sum(item.bound for item in (*self.kept, *self.left_out, *self.bounds))
 
+    @cached_property
+    def ready(self) -> Prepared:
+        """The engine made ready for the problem."""
+        return self.engine.prepare(self.problem, self.engine_tolerance)
+
     @property
     def slices(self) -> list[tuple[slice, slice]]:
         """Times and channels of every block, in order of time."""
         times, channels, _ = self.problem.shape
         nt, nf = self.block_shape
+        atom = self.ready.atom
+        if (nt < times and nt % atom[0]) or (nf < channels and nf % atom[1]):
+            raise InputError(f"block_shape = {self.block_shape}: {self.engine_name} takes multiples of {atom}")
         return [
             (slice(t, min(t + nt, times)), slice(f, min(f + nf, channels)))
             for t in range(0, times, nt)
@@ -155,7 +165,7 @@ class Plan(VisibilitySet):
         try:
             while todo or waiting:
                 while todo and len(waiting) < ahead:
-                    waiting.append(executor.submit(predict, self.engine, self.problem.block(*todo.pop(0))))
+                    waiting.append(executor.submit(alone, self.ready.task(*todo.pop(0))))
                 block = waiting.popleft().result()
                 done += 1
                 if self.checker is not None:
@@ -197,14 +207,17 @@ class Plan(VisibilitySet):
         """Hold what was produced, `vis` (visibilities or blocks of them), against the definition of the scene as given.
 
         Times and channels at random, all their baselines: each once before any comes twice, as many as 4 % of
-        the planned time buy, `samples` visibilities at least. Without `vis` the engine makes them anew, cell by cell.
+        the planned time buy, `samples` visibilities at least. Without `vis` the engine makes them anew, in whole atoms.
         Raises `InputError` for data of another scene, or from which a beam has been taken out.
         """
         checker = self._checker(samples, seed)
         if vis is not None:
             return watch(checker, as_set(vis).blocks())
-        cells = (self.problem.block(slice(t, t + 1), slice(f, f + 1)) for t, f in checker.chosen())
-        return watch(checker, (predict(self.engine, cell) for cell in cells))
+        nt, nf = self.ready.atom
+        times, channels, _ = self.problem.shape
+        atoms = dict.fromkeys((t // nt * nt, f // nf * nf) for t, f in checker.chosen())
+        cuts = ((slice(t, min(t + nt, times)), slice(f, min(f + nf, channels))) for t, f in atoms)
+        return watch(checker, (alone(self.ready.predict, t, f) for t, f in cuts))
 
     def _checker(self, samples: int, seed: int) -> Checker:
         against = BY_STATIONS if isinstance(self.engine, Direct) else DEFINITION

@@ -19,7 +19,7 @@ from instrument.observe.layout import Layout
 from instrument.observe.observation import Observation
 from instrument.observe.sampling import Sampling
 from instrument.plan import Item, Plan, count_of
-from instrument.predict.base import Predictor, Problem, Work
+from instrument.predict.base import Predictor, Prepared, Problem, Work
 from instrument.predict.rounding import known_gain, rounding, total_flux, unknown_peaks
 from instrument.registry import available, load
 from instrument.sky.base import Sky
@@ -66,21 +66,22 @@ def make_plan(
     problem = _simplify_sky(full, chain, budget, left_out)
     problem = _within(problem, uv_range, left_out)
     kept.append(_w_term(problem))
-    found, label, bound, refused = _choose(problem, engine, budget)
+    ready, label, refused = _choose(problem, engine, budget)
     limit = _limit(memory)
-    shape, work, peak = _blocks(found, problem, workers, limit)
+    shape, work, peak = _blocks(ready, workers, limit)
     rounded = Item(_rounding_name(problem), "", rounding(problem, scale_jy))
     unmodelled = not_modelled(problem, scale_jy)
     _say_what_exceeds(tolerance, rounded.bound, unmodelled)
-    return Plan(
+    plan = Plan(
         name=name,
         full=replace(full, antenna1=problem.antenna1, antenna2=problem.antenna2),
         problem=problem,
         kept=tuple(kept),
         left_out=tuple(left_out),
         not_modelled=tuple(unmodelled),
-        engine=found,
+        engine=ready.engine,
         engine_name=label,
+        engine_tolerance=budget.left,
         refused=tuple(refused),
         work=work,
         block_shape=shape,
@@ -88,10 +89,12 @@ def make_plan(
         memory=peak,
         limit=limit,
         tolerance=tolerance,
-        bounds=(Item(label, "", bound), rounded) if bound else (rounded,),
+        bounds=(Item(label, "", ready.bound), rounded) if ready.bound else (rounded,),
         scale_jy=scale_jy,
         seconds=work.seconds / workers,
     )
+    vars(plan)["ready"] = ready  # or it would be prepared a second time
+    return plan
 
 
 def _say_coincident(layout: Layout) -> None:
@@ -241,8 +244,8 @@ def _w_term(problem: Problem) -> Item:
     return Item("w-term", f"without it phases could be wrong by {turns:.2g} turns")
 
 
-def _choose(problem: Problem, name: str | None, budget: Budget) -> tuple[Predictor, str, float, list[Item]]:
-    """The cheapest engine, prepared: with its name, the bound on its own error, and the engines that refuse."""
+def _choose(problem: Problem, name: str | None, budget: Budget) -> tuple[Prepared, str, list[Item]]:
+    """The cheapest engine, prepared, with its name, and the engines that refuse."""
     plugins = available("engines")
     if name is not None and name not in plugins:
         raise InputError(f"no engine is called '{name}': {did_you_mean(name, plugins)}")
@@ -257,13 +260,15 @@ def _choose(problem: Problem, name: str | None, budget: Budget) -> tuple[Predict
             refused.append(Item(label, why))
         else:
             fit.append((engine.work(problem).seconds, label, engine))
-    chosen = [entry for entry in fit if name in (None, entry[1])]
-    if not chosen:
-        reasons = "; ".join(f"{i.name}: {i.reason}" for i in refused if name in (None, i.name))
-        raise RefusedError(f"no engine serves this scene ({reasons})")
-    _, label, engine = min(chosen, key=lambda entry: entry[0])
-    prepared = engine.prepare(problem, budget.left)
-    return prepared.engine, label, prepared.bound, refused
+    for _, label, engine in sorted(fit, key=lambda entry: entry[0]):
+        if name not in (None, label):
+            continue
+        try:
+            return engine.prepare(problem, budget.left), label, refused
+        except RefusedError as error:
+            refused.append(Item(label, str(error)))
+    reasons = "; ".join(f"{i.name}: {i.reason}" for i in refused if name in (None, i.name))
+    raise RefusedError(f"no engine serves this scene ({reasons})")
 
 
 def _limit(memory: Any) -> float:
@@ -275,26 +280,27 @@ def _limit(memory: Any) -> float:
     return float(found)
 
 
-def _blocks(engine: Predictor, problem: Problem, workers: int, limit: float) -> tuple[tuple[int, int], Work, float]:
-    """Times and channels per block, the work of the whole, and the peak of what is held at once."""
-    times, channels, baselines = problem.shape
-    one = engine.work(problem.block(slice(0, 1), slice(0, 1)))
+def _blocks(ready: Prepared, workers: int, limit: float) -> tuple[tuple[int, int], Work, float]:
+    """Times and channels per block, whole atoms; the work of the whole, in such blocks; the peak of what is held."""
+    times, channels, baselines = ready.problem.shape
+    nt, nf = min(ready.atom[0], times), min(ready.atom[1], channels)
     result = 64.0 * baselines
+    whole, one = ready.work(), ready.work(slice(0, nt), slice(0, nf))
     # every worker holds a block and its result, and one more result of each may wait to be taken
-    slot = one.bytes + result
-    slots = int(min(BLOCK_BYTES, limit / workers) // slot)
-    if slots < 1:
-        if slot * workers > limit:
+    slot = one.slot_bytes + result * nt * nf
+    atoms = int(min(BLOCK_BYTES, (limit - whole.shared_bytes) / workers) // slot)
+    if atoms < 1:
+        if (least := whole.shared_bytes + slot * workers) > limit:
             raise RefusedError(
-                f"one block needs {si_prefix(slot * workers, 'B')} and the limit is {si_prefix(limit, 'B')}: give "
+                f"one block needs {si_prefix(least, 'B')} and the limit is {si_prefix(limit, 'B')}: give "
                 "more memory (--memory), or fewer sources (--set sky.brightest=N)"
             )
-        slots = 1
-    in_block = min(channels, slots)
-    shape = (max(1, min(times, slots // in_block)), in_block)
-    whole = engine.work(problem)
-    held = engine.work(problem.block(slice(0, shape[0]), slice(0, shape[1]))).bytes
-    return shape, whole, workers * held + workers * result * shape[0] * shape[1]
+        atoms = 1
+    across = min(-(-channels // nf), atoms)
+    shape = (min(times, nt * max(1, atoms // across)), min(channels, nf * across))
+    held = ready.work(slice(0, shape[0]), slice(0, shape[1])).slot_bytes
+    work = whole._replace(slot_bytes=held)
+    return shape, work, work.shared_bytes + workers * (held + result * shape[0] * shape[1])
 
 
 def _rounding_name(problem: Problem) -> str:

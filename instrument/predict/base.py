@@ -1,9 +1,11 @@
-"""Predictor: an engine that turns a problem (a block of a scene) into visibilities."""
+"""Predictor: an engine that turns a problem (a block of a scene) into visibilities; Prepared: one made ready."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -16,20 +18,20 @@ from instrument.sky.base import Sky
 from instrument.units import Complex, Int
 from instrument.visibilities import BeamState, Visibilities
 
+EVERY = slice(None)
+
 
 class Work(NamedTuple):
-    """What a problem costs: floating point operations, bytes held at once, and an estimate of seconds on one core."""
+    """What a problem costs: floating point operations, bytes, and an estimate of seconds on one core.
+
+    `shared_bytes` are held once, however many workers there are; `slot_bytes` by each worker, for the problem as one
+    block.
+    """
 
     flops: float
-    bytes: float
+    shared_bytes: float
+    slot_bytes: float
     seconds: float
-
-
-class Prepared(NamedTuple):
-    """An engine as it will be run on a problem, and a bound on its own error, relative to the total flux."""
-
-    engine: Predictor
-    bound: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,18 @@ class Problem:
         """The same for some baselines."""
         return replace(self, antenna1=np.asarray(antenna1), antenna2=np.asarray(antenna2))
 
+    def visibilities(self, data: Complex) -> Visibilities:
+        """Data (T, F, B, 2, 2) with the coordinates of the problem."""
+        return Visibilities(
+            data=data,
+            at=self.at.at_centre(),
+            antenna1=self.antenna1,
+            antenna2=self.antenna2,
+            interval_s=self.interval_s,
+            width_hz=self.width_hz,
+            beam_state=BeamState(beams=self.chain.beams()),
+        )
+
     @property
     def shape(self) -> tuple[int, int, int]:
         """(T, F, B)."""
@@ -60,7 +74,10 @@ class Problem:
 
 @checked
 class Predictor(Component):
-    """An engine: says what it refuses and what a problem costs, and computes V_ab = sum_s J_a B J_b^H K_ab."""
+    """An engine: says what it refuses and what a problem costs, and computes V_ab = sum_s J_a B J_b^H K_ab.
+
+    One that keeps nothing between blocks gives `sums`; one that does gives `prepare`.
+    """
 
     plugin_kind: ClassVar[str | None] = "engines"
 
@@ -69,28 +86,68 @@ class Predictor(Component):
         return None
 
     def prepare(self, problem: Problem, tolerance: float) -> Prepared:
-        """The engine for a whole problem, which it may approximate with an error of at most `tolerance`.
+        """The engine made ready for a whole problem, which it may approximate with an error of at most `tolerance`.
 
-        An exact engine is ready as it is. Blocks of the problem, of any times and channels, are then asked of `sums`.
+        Decides, and leaves what is large to the first sums: most plans are only read. Raises `RefusedError` where the
+        tolerance cannot be kept. An engine without state is ready as it is.
         """
-        return Prepared(self)
+        return Blockwise(self, problem)
 
     @abstractmethod
     def work(self, problem: Problem) -> Work:
-        """Cost of a problem; the bytes are those of one block held at once."""
+        """Cost of a problem, done as one block."""
 
-    @abstractmethod
     def sums(self, problem: Problem) -> Complex:
-        """Visibilities in Jy, complex (T, F, B, 2, 2)."""
+        """Visibilities in Jy, complex (T, F, B, 2, 2), of an engine without state: blocks may be cut anywhere."""
+        raise NotImplementedError(f"{type(self).__name__} has neither sums nor a prepare of its own")
 
     def predict(self, problem: Problem) -> Visibilities:
         """The same with their coordinates."""
-        return Visibilities(
-            data=self.sums(problem),
-            at=problem.at.at_centre(),
-            antenna1=problem.antenna1,
-            antenna2=problem.antenna2,
-            interval_s=problem.interval_s,
-            width_hz=problem.width_hz,
-            beam_state=BeamState(beams=problem.chain.beams()),
-        )
+        return problem.visibilities(self.sums(problem))
+
+
+@dataclass(frozen=True)
+class Prepared(ABC):
+    """An engine ready for one problem, with the `bound` on its own error (relative to the total flux) and its `atom`.
+
+    Sums are asked for whole atoms, from many threads at once: slices of times and channels that begin and end at
+    multiples of `atom` (times, channels), or end where the problem does. `work` is the cost of such a block.
+    """
+
+    engine: Predictor
+    problem: Problem
+    bound: float = 0.0
+    atom: tuple[int, int] = (1, 1)
+
+    @abstractmethod
+    def sums(self, times: slice, channels: slice, pairs: tuple[Int, Int] | None = None) -> Complex:
+        """Visibilities in Jy, complex (T, F, B, 2, 2), of some times and channels, on `pairs` of antennas or on all."""
+
+    def work(self, times: slice = EVERY, channels: slice = EVERY) -> Work:
+        """Cost of some times and channels, as one block; `shared_bytes` are of what was prepared."""
+        return self.engine.work(self.block(times, channels))
+
+    def block(self, times: slice, channels: slice, pairs: tuple[Int, Int] | None = None) -> Problem:
+        """Some times and channels of the problem, on all baselines or on some."""
+        found = self.problem.block(times, channels)
+        return found if pairs is None else found.between(*pairs)
+
+    def predict(self, times: slice, channels: slice) -> Visibilities:
+        """The sums of a block with their coordinates."""
+        return self.block(times, channels).visibilities(self.sums(times, channels))
+
+    def task(self, times: slice, channels: slice) -> Callable[[], Visibilities]:
+        """`predict` of a block for a worker: all that goes to another process, if that is where the worker is."""
+        return partial(self.predict, times, channels)
+
+
+class Blockwise(Prepared):
+    """An engine without state, as it is: every block is a problem of its own, and travels alone."""
+
+    def sums(self, times: slice, channels: slice, pairs: tuple[Int, Int] | None = None) -> Complex:
+        """Visibilities in Jy, complex (T, F, B, 2, 2)."""
+        return self.engine.sums(self.block(times, channels, pairs))
+
+    def task(self, times: slice, channels: slice) -> Callable[[], Visibilities]:
+        """The engine and the block alone."""
+        return partial(self.engine.predict, self.block(times, channels))

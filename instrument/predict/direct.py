@@ -22,7 +22,7 @@ class Direct(Predictor):
         stations, sources = problem.at.shape[2:]
         units = times * channels * baselines * sources
         held = times * channels * sources * (64 * stations * 3 + 64 * 6) + 64 * times * channels * baselines
-        return Work(150.0 * units, float(held), 150e-9 * units + 1e-4 * baselines)
+        return Work(150.0 * units, 0.0, float(held), 150e-9 * units + 1e-4 * baselines)
 
     def sums(self, problem: Problem) -> Complex:
         """Visibilities in Jy, complex (T, F, B, 2, 2)."""

@@ -53,7 +53,7 @@ class Matrix(Predictor):
         shared = 64 * shares * sources * (8 if shares <= FEW else 4)
         wide = 16 * 8 * stations * sources if shares > FEW else 0
         held = slots * (3.2 * scalars + shared + wide + 24 * 8 * sources + 64 * 2.1 * len(problem.antenna1))
-        return Work(flops, held, seconds)
+        return Work(flops, 0.0, held, seconds)
 
     def sums(self, problem: Problem) -> Complex:
         """Visibilities in Jy, complex (T, F, B, 2, 2)."""

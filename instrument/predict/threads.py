@@ -7,9 +7,6 @@ from functools import cache
 from threading import Lock
 from typing import Any, TypeVar
 
-from instrument.predict.base import Predictor, Problem
-from instrument.visibilities import Visibilities
-
 R = TypeVar("R")
 
 
@@ -66,8 +63,3 @@ def alone(work: Callable[..., R], *given: Any) -> R:
     """What `work` makes of `given`, in a worker."""
     with ONE_THREAD:
         return work(*given)
-
-
-def predict(engine: Predictor, problem: Problem) -> Visibilities:
-    """A block, in a worker of any kind."""
-    return alone(engine.predict, problem)

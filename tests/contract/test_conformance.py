@@ -476,7 +476,7 @@ class FirstTimeOnly(Direct):
 
 class CostsNothing(Direct):
     def work(self, problem):
-        return Work(0.0, 1.0, 1.0)
+        return Work(0.0, 0.0, 1.0, 1.0)
 
 
 class OtherInterval(Direct):

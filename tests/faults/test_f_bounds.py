@@ -31,7 +31,7 @@ from instrument import (
 )
 from instrument.jones.base import Simplified
 from instrument.observe.directions import offset
-from instrument.predict.base import Predictor, Prepared
+from instrument.predict.base import Blockwise, Predictor
 from instrument.predict.direct import Direct
 from instrument.predict.rounding import total_flux
 
@@ -150,7 +150,7 @@ class Coarse(Predictor):
     factor: float = 1.0
 
     def prepare(self, problem, tolerance):
-        return Prepared(Coarse(factor=1 + 0.5 * tolerance), 0.5 * tolerance)
+        return Blockwise(Coarse(factor=1 + 0.5 * tolerance), problem, 0.5 * tolerance)
 
     def work(self, problem):
         return Direct().work(problem)
@@ -332,7 +332,7 @@ def test_total_flux_is_that_of_the_brightest_channel():
 def test_f2_conformance_finds_an_engine_whose_bound_is_not_held():
     class Liar(Coarse):
         def prepare(self, problem, tolerance):
-            return Prepared(Coarse(factor=1 + tolerance), 1e-3 * tolerance)
+            return Blockwise(Coarse(factor=1 + tolerance), problem, 1e-3 * tolerance)
 
     broken = [line.claim for line in instrument.conformance.check(Liar()).failed]
     assert any(claim.startswith("it agrees with direct") for claim in broken)
