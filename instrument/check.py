@@ -202,11 +202,7 @@ def watch(checker: Checker, blocks: Iterable[Visibilities]) -> Check:
 def cell_seconds(problem: Problem) -> float:
     """What the definition of one time and channel on all baselines costs, on one core."""
     stations, sources = problem.at.shape[2:]
-    parts = sum(
-        level.offsets_m.shape[1] * len(level.distinct[0])
-        for term in problem.chain.parts
-        for level in getattr(term, "levels", ())
-    )
+    parts = sum(term.phasors() for term in problem.chain.parts)
     listed = problem.sky.sources()
     shaped = sources if listed is None else int(listed.gaussian.sum())
     matrices = 0.1e-6 + 0.35e-6 * len(problem.chain.terms)

@@ -9,6 +9,7 @@ import re
 import sys
 from abc import ABC
 from collections.abc import Mapping
+from difflib import get_close_matches
 from types import UnionType
 from typing import Any, ClassVar, Self, Union, get_args, get_origin
 
@@ -224,7 +225,7 @@ def class_of(data: Mapping[str, Any], wanted: type[Component]) -> type[Any]:
             if not issubclass(found, wanted):
                 raise InputError(f"'{tag}' is {found.__name__}, which is not a {wanted.__name__}")
             return found
-    if wanted.plugin_kind:
+    if wanted.plugin_kind and not get_close_matches(tag, known, cutoff=0.8):
         plugin_class(wanted.plugin_kind, tag, needed=True)
     raise InputError(f"no {wanted.__name__} is called {brief(tag)}: {did_you_mean(tag, known)}")
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import functools
+import json
 from abc import abstractmethod
-from typing import Any, ClassVar, Literal
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
+from pydantic import BeforeValidator
 
 from instrument import mat2
 from instrument.checked import checked
@@ -23,17 +27,72 @@ from instrument.units import Complex, Direction, Float, direction, icrs_of, inst
 State = Literal["absolute", "differential"]
 
 
+def _of_chain(value: Any) -> Any:
+    """The terms of a chain, or of the text of one."""
+    if isinstance(value, Mapping) and "terms" in value:
+        value = Chain.from_json(json.dumps(value))
+    return value.terms if isinstance(value, Chain) else value
+
+
+def _directional(term: JonesTerm) -> bool:
+    return any(part.directional for part in term.parts())
+
+
+def _whole(chain: Callable[[Any], Chain]) -> Callable[[Any], Chain]:
+    """The `chain` of a class of instruments with all that was given to the instrument; what is there stays there."""
+
+    @functools.wraps(chain)
+    def whole(self: Instrument) -> Chain:
+        found = chain(self)
+        place = 0
+        for term in self.errors():
+            there = _place(found, term, self)
+            if there is None:
+                found = found.with_term(term, place)
+                there = place
+            place = there + 1
+        others = self._entering(errors=False)
+        for k, term in enumerate(others):
+            if _place(found, term, self) is None:
+                alike = (_place(found, t, self) for t in others[:k] if t.maps == term.maps)
+                begin = [1 + n for n in alike if n is not None]
+                found = found.with_term(term, max([len(found.gains().terms), *begin]))
+        return found
+
+    return whole
+
+
+def _place(chain: Chain, term: JonesTerm, given: Instrument) -> int | None:
+    """Where a term that was given stands in a chain: itself, alone or in a composite; an equal gain or feed will do."""
+    equal = term is given.gain or term is given.feed
+    for k, whole in enumerate(chain.terms):
+        if any(part is term or (equal and part == term) for part in (whole, *whole.parts())):
+            return k
+    return None
+
+
 @checked
 class Instrument(Component):
     """A radio interferometer: a subclass has its own fields and gives `layout()` and `chain()`.
 
-    `gain` and `feed` are the direction-independent errors of its receivers. A chain whose last term takes "sky" is
-    complete; where none does (no beam), the feeds are taken to lie along north and east.
+    `gain`, `feed` and `terms` (more Jones terms, receiver to sky) can be given to every instrument: what a subclass
+    leaves out of its chain of them is put in here, so that none can be forgotten. Errors of the receivers (`gain`,
+    `feed`, and those of `terms` that take and give "feed" and are the same for every direction) are the left end of the
+    chain. Each other term stands right of all that is the same for every direction, at the leftmost place where its
+    bases fit; of two with the same bases the first stands left. A chain whose last term takes "sky" is complete; where
+    none does (no beam), the feeds are taken to lie along north and east.
     """
 
     plugin_kind: ClassVar[str | None] = "telescopes"
+    terms_enter: ClassVar[bool] = True  # False where `terms` are the chain itself
     gain: GainTerm | None = None
     feed: FeedTerm | None = None
+    terms: Annotated[tuple[JonesTerm, ...], BeforeValidator(_of_chain)] = ()
+
+    def __init_subclass__(cls, **settings: Any) -> None:
+        super().__init_subclass__(**settings)
+        if "chain" in vars(cls):
+            cls.chain = _whole(vars(cls)["chain"])  # type: ignore[method-assign,assignment]
 
     @abstractmethod
     def layout(self) -> Layout:
@@ -41,22 +100,24 @@ class Instrument(Component):
 
     @abstractmethod
     def chain(self) -> Chain:
-        """Jones terms, receiver to sky."""
+        """Jones terms, receiver to sky; whoever calls it finds gain, feed and terms in it."""
 
     def receivers(self) -> tuple[JonesTerm, ...]:
-        """Gains and feed errors, for the left end of a chain; the identity where none are given."""
-        return self.gain or GainTerm(), self.feed or FeedTerm()
+        """Errors of the receivers, the left end of the chain; the identity for a gain or feed that is not given."""
+        return *self._entering(errors=True), self.gain or GainTerm(), self.feed or FeedTerm()
 
-    def checked_chain(self) -> Chain:
-        """`chain()`; raises `InputError` where it leaves out the gains or feeds of this instrument."""
-        chain = self.chain()
-        for name, term in (("gain", self.gain), ("feed", self.feed)):
-            if term is not None and not any(part == term for part in chain.parts):
-                raise InputError(
-                    f"{type(self).__name__}.chain() leaves out the '{name}' that was given: let it begin with "
-                    "*self.receivers()"
-                )
-        return chain
+    def errors(self) -> tuple[JonesTerm, ...]:
+        """Those errors of the receivers that were given: what calibration is there to find."""
+        return *self._entering(errors=True), *(t for t in (self.gain, self.feed) if t is not None)
+
+    def perfect(self) -> Self:
+        """The same instrument without errors of its receivers: what a calibration compares with."""
+        left = self._entering(errors=False) if self.terms_enter else self.terms
+        return self.with_fields(gain=None, feed=None, terms=left)
+
+    def _entering(self, errors: bool) -> tuple[JonesTerm, ...]:
+        terms = self.terms if self.terms_enter else ()
+        return tuple(t for t in terms if (t.maps == ("feed", "feed") and not _directional(t)) == errors)
 
     def beam(
         self, directions: Any, times: Any, frequencies: Any, pointing: Any = None, state: State = "absolute"
@@ -71,7 +132,7 @@ class Instrument(Component):
         if state not in ("absolute", "differential"):
             raise InputError(f"state = '{state}' is not a state of a beam: 'absolute' or 'differential'")
         at = self.sampling(directions, times, frequencies, pointing)
-        whole = self.checked_chain()
+        whole = self.chain()
         warn_outside_band(whole, at.freq_hz)
         chain, _ = whole.simplified(at)
         found = chain.jones(at)
@@ -93,11 +154,14 @@ class Instrument(Component):
         baseline: tuple[str, str] | None = None,
         state: State = "differential",
     ) -> Complex:
-        """Mueller matrices of one baseline (the first by default), complex (T, F, S, 4, 4)."""
+        """Mueller matrices of one baseline, complex (T, F, S, 4, 4).
+
+        The first by default; that of a station with itself where there is one alone.
+        """
         layout = self.layout()
         if isinstance(baseline, str):
             raise InputError(f"baseline = '{baseline}' is one station: give two, ('{baseline}', ...)")
-        pair = layout.names[:2] if baseline is None else tuple(baseline)
+        pair = (layout.names * 2)[:2] if baseline is None else tuple(baseline)
         if len(pair) != 2 or not all(isinstance(n, str) for n in pair):
             raise InputError(f"baseline = {pair} must be the names of two stations")
         a, b = (layout.index(n) for n in pair)
@@ -130,8 +194,8 @@ class Instrument(Component):
 class Composed(Instrument):
     """An instrument put together by hand from a layout and Jones terms, receiver to sky."""
 
+    terms_enter: ClassVar[bool] = False
     stations: Layout
-    terms: Chain = Chain()
 
     def layout(self) -> Layout:
         """The layout as given."""
@@ -139,7 +203,7 @@ class Composed(Instrument):
 
     def chain(self) -> Chain:
         """Gains and feed errors if given, then the terms as given."""
-        return Chain(*(t for t in (self.gain, self.feed) if t is not None), *self.terms.terms)
+        return Chain(*self.errors(), *self.terms)
 
 
 def warn_outside_band(chain: Chain, freq_hz: Float) -> None:

@@ -45,7 +45,12 @@ def make_plan(
     tolerance = TOLERANCE.check(tolerance, "tolerance")
     workers = (os.cpu_count() or 1) if workers is None else COUNT.check(workers, "workers")
     uv_range = None if uv_range is None else UV_RANGE.check(uv_range, "uv_range")
-    layout, chain = instrument.layout(), instrument.checked_chain()
+    layout, chain = instrument.layout(), instrument.chain()
+    if len(layout) < 2:
+        raise InputError(
+            f"an interferometer needs at least two stations, got {', '.join(layout.names)}: one alone has a beam and "
+            "no visibilities"
+        )
     sky = sky.about(observation.phase_centre)
     warn_outside_band(chain, observation.freq_hz)
     ra, dec = sky.directions()

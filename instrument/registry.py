@@ -1,8 +1,7 @@
 """Plugins by name, found through entry points: `available`, `load`.
 
-Groups: `instrument.elements`, `instrument.telescopes`, `instrument.engines`, `instrument.foregrounds`,
-`instrument.skies`, `instrument.stages`. Entry points are read on first use, never at import. Our own plugins come in by
-the same door as a stranger's.
+Groups: "instrument." and one of `KINDS`. Entry points are read on first use, never at import. Our own plugins come in
+by the same door as a stranger's.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from typing import Any
 from instrument.checked import checked
 from instrument.errors import PluginError, did_you_mean
 
-KINDS = ("elements", "telescopes", "engines", "foregrounds", "skies", "stages")
+KINDS = ("elements", "telescopes", "terms", "engines", "foregrounds", "skies", "stages")
 
 
 @dataclass(frozen=True)

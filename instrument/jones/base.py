@@ -43,6 +43,7 @@ class JonesTerm(Component):
     - `directional`: False when it is the same for every direction.
     """
 
+    plugin_kind: ClassVar[str | None] = "terms"
     maps: ClassVar[tuple[Basis, Basis]]
     structure: ClassVar[Structure] = "full"
     per_station: ClassVar[PerStation] = "own"
@@ -60,6 +61,10 @@ class JonesTerm(Component):
     def parts(self) -> tuple[JonesTerm, ...]:
         """The terms this one is the product of, receiver to sky; itself unless it is a composite."""
         return (self,)
+
+    def phasors(self) -> int:
+        """How many sines and cosines it takes for each time, channel and direction: what an engine plans with."""
+        return 0
 
     def peak(self, at: Sampling) -> float:
         """A bound on the largest singular value of the term at any time, station and direction; infinity if unknown.

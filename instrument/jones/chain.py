@@ -14,6 +14,7 @@ from instrument.checked import checked
 from instrument.component import Component
 from instrument.errors import BasisError
 from instrument.jones.base import JonesTerm, Simplified, Structure
+from instrument.numbers import Index
 from instrument.observe.sampling import Sampling
 from instrument.units import Complex, Int, NotNegative
 
@@ -90,10 +91,35 @@ class Chain(Component):
         fates = [(term, term.simplify(at, tolerance)) for term in self.terms]
         return Chain(*(fate.term for _, fate in fates if fate.term is not None)), fates
 
+    def gains(self) -> Chain:
+        """The terms that are the same for every direction, as far as the left end of the chain holds no other.
+
+        `gains()` and then `beams()` are the chain.
+        """
+        return Chain(*self.terms[: self._first_beam()])
+
     def beams(self) -> Chain:
         """The terms that differ between directions: the chain without its direction-independent left end."""
-        first = next((i for i, t in enumerate(self.terms) if any(p.directional for p in t.parts())), len(self.terms))
-        return Chain(*self.terms[first:])
+        return Chain(*self.terms[self._first_beam() :])
+
+    def _first_beam(self) -> int:
+        return next((i for i, t in enumerate(self.terms) if any(p.directional for p in t.parts())), len(self.terms))
+
+    def with_term(self, term: JonesTerm, begin: Index = 0) -> Chain:
+        """The chain with one term more, at the leftmost place from `begin` on where its bases fit.
+
+        Raises `BasisError` where there is none.
+        """
+        takes, gives = term.maps
+        for k in range(begin, len(self.terms) + 1):
+            before, after = self.terms[k - 1 : k] if k else (), self.terms[k : k + 1]
+            if all(t.maps[0] == gives for t in before) and all(t.maps[1] == takes for t in after):
+                return Chain(*self.terms[:k], term, *self.terms[k:])
+        places = [t.maps[1] for t in self.terms[:1]] + [t.maps[0] for t in self.terms]
+        raise BasisError(
+            f"{type(term).__name__} takes '{takes}' and gives '{gives}', which fits nowhere in the chain "
+            f"{', '.join(type(t).__name__ for t in self.terms)}, whose bases are {', '.join(map(repr, places))}"
+        )
 
     def _outer_count(self) -> int:
         return next((i for i, t in enumerate(self.parts) if t.directional), len(self.parts))

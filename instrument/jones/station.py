@@ -74,6 +74,10 @@ class ArrayFactor(ScalarTerm):
             out = out * factor.reshape(times, channels, -1, sources)[:, :, which]
         return np.asarray(out)
 
+    def phasors(self) -> int:
+        """One for each part of every different layout, level by level."""
+        return sum(level.offsets_m.shape[1] * len(level.distinct[0]) for level in self.levels)
+
     def peak(self, at: Sampling) -> float:
         """1: a mean of unit vectors."""
         return 1.0

@@ -44,10 +44,8 @@ class Layout(Component):
         twice = sorted({n for n in self.names if self.names.count(n) > 1})
         if twice:
             raise InputError(f"station '{twice[0]}' is given twice")
-        if count < 2:
-            raise InputError(
-                f"an interferometer needs at least two stations, got {count}: {', '.join(self.names) or 'none'}"
-            )
+        if not count:
+            raise InputError("a layout needs at least one station")
         if not (np.all(np.isfinite(self.positions_m)) and np.all(np.isfinite(self.axes))):
             raise InputError("positions and axes of stations must be finite")
         skew = np.abs(self.axes @ np.swapaxes(self.axes, 1, 2) - np.eye(3)).max()
@@ -153,7 +151,20 @@ class Layout(Component):
     def longest_m(self) -> float:
         """Longest baseline, m."""
         a, b = self.baselines
-        return float(np.linalg.norm(self.positions_m[a] - self.positions_m[b], axis=1).max())
+        return float(np.linalg.norm(self.positions_m[a] - self.positions_m[b], axis=1).max(initial=0.0))
+
+    @cached_property
+    def one_per_frame(self) -> Layout:
+        """The first station of every distinct set of axes, the array itself where all differ."""
+        first, _ = self.frames
+        if len(first) == len(self):
+            return self
+        rows = [self.positions_m[first], self.axes[first]]
+        for row in rows:
+            row.setflags(write=False)
+        names = tuple(self.names[k] for k in first)
+        # they have been looked at: a part of an array wider than 1000 km need not stand upright by itself
+        return Layout.model_construct(names=names, positions_m=rows[0], axes=rows[1])
 
 
 def _demand_distance(names: Sequence[str], positions_m: Float, limits: tuple[float, float]) -> None:

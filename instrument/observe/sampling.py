@@ -102,10 +102,8 @@ class Sampling:
 
     def one_per_frame(self) -> Sampling:
         """The same for one station of each distinct set of axes (`layout.frames`)."""
-        first, _ = self.layout.frames
-        if len(first) == len(self.layout):
-            return self
-        return replace(self, layout=_Axes(self.layout.axes[first]))  # type: ignore[arg-type]
+        few = self.layout.one_per_frame
+        return self if few is self.layout else replace(self, layout=few)
 
     @cached_property
     def vectors(self) -> Float:
@@ -194,16 +192,6 @@ class Sampling:
         """Station coordinates u, v, w in m about the array's centre (T, A, 3); u_ab = u_a - u_b."""
         relative = self.layout.positions_m - self.layout.centre_m
         return relative[None] @ np.swapaxes(self.earth.uvw_axes(self.centre), 1, 2)
-
-
-@dataclass(frozen=True)
-class _Axes:
-    """Stands for a layout where only the axes of its stations matter (one station of each frame)."""
-
-    axes: Float
-
-    def __len__(self) -> int:
-        return len(self.axes)
 
 
 def mjd_seconds(times: Any) -> Float:

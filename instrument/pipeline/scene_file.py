@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import replace
 from functools import cached_property
 from typing import Annotated, Any, Self
@@ -9,8 +10,9 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from instrument.component import Component
+from instrument.component import KIND, Component, class_of, public_name
 from instrument.errors import InputError, did_you_mean, unused
+from instrument.jones.base import JonesTerm
 from instrument.jones.feed import FeedTerm
 from instrument.jones.gain import GainTerm
 from instrument.model import Instrument
@@ -123,6 +125,8 @@ class SceneFile(Component):
             if isinstance(settings.get(key), dict):
                 with _in_table(f"instrument.{key}"):
                     settings[key] = cls(**{"seed": SEED_STEP * self.seed + step, **settings[key]})
+        if "terms" in settings:
+            settings["terms"] = _terms(settings["terms"], self.seed)
         with _in_table("instrument"):
             found: Instrument = load("telescopes", name, **settings)
         return found
@@ -161,10 +165,10 @@ class SceneFile(Component):
         for name, stage in self.running.items():
             with _in_table(name):
                 stage.check(scene)
-        errors = [name for name in ("gain", "feed") if getattr(scene.instrument, name) is not None]
+        errors = [public_name(type(term)) for term in scene.instrument.errors()]
         perfect = any(stage.perfect for stage in self.running.values())
         if perfect:
-            scene = scene.with_fields(instrument=scene.instrument.with_fields(gain=None, feed=None))
+            scene = scene.with_fields(instrument=scene.instrument.perfect())
         found = scene.plan(
             tolerance=self.tolerance,
             engine=self.engine,
@@ -176,6 +180,8 @@ class SceneFile(Component):
         kept, left_out = [*found.kept], [*found.left_out]
         if perfect and errors:
             kept.append(Item("receivers", f"{' and '.join(errors)}: put into the perfect blocks as they pass"))
+            if known := [public_name(type(term)) for term in scene.instrument.terms]:
+                kept.append(Item("model", f"{' and '.join(known)}: in it too, not an error of the receivers"))
             left_out = [item for item in left_out if item.name not in ("GainTerm", "FeedTerm")]
         if self.running:
             kept.append(Item("stages", ", ".join(self.running) + (", in this order" if len(self.running) > 1 else "")))
@@ -193,6 +199,23 @@ class SceneFile(Component):
             unused("scene", given, f"a laboratory, [{alone}] kind = '{kind}', makes its own figures")
         if self.observation.frequency is not None and self.observation.channel_width is not None:
             unused("[observation]", ["channel_width"], "'frequency' has its width")
+
+
+def _terms(tables: Any, seed: int) -> tuple[JonesTerm, ...]:
+    """The Jones terms of [instrument.terms.LABEL], in the order of the file; one that draws has a seed of its own."""
+    if not isinstance(tables, dict) or not all(isinstance(table, dict) for table in tables.values()):
+        raise InputError("[instrument] 'terms' must be tables, [instrument.terms.LABEL] with a 'kind'")
+    found = []
+    for label, settings in tables.items():
+        with _in_table(f"instrument.terms.{label}"):
+            if KIND not in settings:
+                raise InputError(f"needs 'kind': one of {', '.join(available('terms'))}")
+            cls = class_of(settings, JonesTerm)
+            # of its label: a term more or less in the file changes none of the others
+            own = (SEED_STEP * seed << 32) + zlib.crc32(label.encode())
+            drawn = {"seed": own} if "seed" in cls.model_fields else {}
+            found.append(cls(**{**drawn, **{k: v for k, v in settings.items() if k != KIND}}))
+    return tuple(found)
 
 
 def top_level() -> list[str]:

@@ -38,11 +38,7 @@ class Matrix(Predictor):
         shares = problem.chain.shares(problem.at.layout)
         products = _products(problem, shares)
         gemm = 8.0 * slots * sources * stations**2 * products
-        parts = sum(
-            level.offsets_m.shape[1] * len(level.distinct[0])
-            for term in problem.chain.parts
-            for level in getattr(term, "levels", ())
-        )
+        parts = sum(term.phasors() for term in problem.chain.parts)
         # 40 operations for each sine and cosine (2.3 ns), 600 for each shared 2x2 matrix and source (250 ns)
         phasors = float(slots * sources * (stations + parts))
         matrices = float(slots * sources * shares)

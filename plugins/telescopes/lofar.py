@@ -56,8 +56,6 @@ class _Lofar(Instrument):
         for name in value:
             if name not in names:
                 raise InputError(f"no station {brief(name)} in {cls.__name__}: {did_you_mean(name, names)}")
-        if len(value) < 2:
-            raise InputError(f"an interferometer needs at least two stations, got {len(value)}: {', '.join(value)}")
         return tuple(value)
 
     def _rows(self) -> Any:

@@ -84,7 +84,7 @@ def test_the_order_of_stations_is_a_matter_of_names(made):
     """Reversed: every baseline is the conjugate transpose. Drawn errors belong to places in the list: left out here."""
     one, _, _ = made
     still = one.with_fields(instrument=one.instrument.with_fields(
-        terms=Chain(*(t for t in one.instrument.terms.terms if isinstance(t, CrossedDipole | Parallactic)))
+        terms=Chain(*(t for t in one.instrument.terms if isinstance(t, CrossedDipole | Parallactic)))
     ))  # fmt: skip
     vis = seen(still)
     layout = still.instrument.stations

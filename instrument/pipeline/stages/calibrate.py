@@ -23,6 +23,7 @@ from instrument.pipeline.stage import Beside, Draw, Running, Stage, StageResult,
 from instrument.pipeline.stages.image import Image
 from instrument.registry import names
 from instrument.report.page import Block, Card, Figures, Section, Table, Text, number
+from instrument.units import Float
 from instrument.visibilities import Visibilities
 from instrument.whole_file import write_ecsv
 
@@ -67,12 +68,16 @@ class _CalibrateRun(StageRun):
     parts: list[Solution] = field(default_factory=list)
     errors: DISums | None = None
     power: dict[str, float] = field(default_factory=dict)
+    put_in: Float = field(default_factory=lambda: np.zeros(3))  # |J - 1|^2 on and off the diagonal, and how many
 
     @property
     def _rms(self) -> float:
-        """That of the errors put in."""
-        instrument = self.run.instrument
-        return max((t.rms for t in (instrument.gain, instrument.feed) if t is not None), default=0.0)
+        """That of the errors put in: as it was asked of gain and feed, measured where other terms make it."""
+        own = [t for t in (self.run.instrument.gain, self.run.instrument.feed) if t is not None]
+        asked = max((t.rms for t in own), default=0.0)
+        if asked and len(own) == len(self.run.instrument.errors()):
+            return asked
+        return float(np.sqrt(self.put_in[:2].max() / max(self.put_in[2], 1.0)))
 
     def take(self, block: Visibilities) -> Visibilities:
         """Solve a block and correct it; intervals that failed are flagged in what comes back."""
@@ -83,11 +88,14 @@ class _CalibrateRun(StageRun):
         corrected = block.corrected(solution.term)
         # solutions and sums are all that stays of a block: masks, data and models of a long run are GB
         self.parts.append(replace(solution, suspects=np.zeros((1, 1, 1), bool)))
-        if self._rms:
+        if self.run.instrument.errors():
             with self.run.timed("errors"):
                 self.errors = self.errors or DISums(block.antenna1, block.antenna2)
                 truth = solution.truth(Chain(*self.run.instrument.receivers()), block.at)
                 self.errors.add(truth, solution)
+                off = np.abs(truth - np.eye(2)) ** 2
+                diagonal = off.trace(axis1=-2, axis2=-1).sum()
+                self.put_in += diagonal, off.sum() - diagonal, 2 * off[..., 0, 0].size
         made = (lambda: block, lambda: corrected, lambda: block - corrected, lambda: corrected - model)
         with self.run.timed("images"):
             for name, make in zip(IMAGES, made, strict=True):
@@ -101,7 +109,7 @@ class _CalibrateRun(StageRun):
     def finish(self) -> CalibrationResult:
         """Everything that the stage found."""
         solution = Solution.joined(self.parts)
-        errors = self.errors.finish(self._rms) if self.errors else None
+        errors = self.errors.finish(self._rms) if self.errors and self._rms else None
         with self.run.timed("images"):
             cubes = {name: images.finish() for name, images in self.images.items()}
         image = self.run.stage("image", Image)
