@@ -44,6 +44,7 @@ _HOME = {
     "Visibilities": "visibilities",
     "BeamState": "beam_state",
     "VisibilitySet": "visibilities",
+    "VisibilityFile": "visibility_sets",
     "JonesTable": "jones.table",
     "Calibrator": "calibrate.base",
     "Solution": "calibrate.base",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -10,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from instrument import mat2
+from instrument import mat2, store
 from instrument.beam_state import BeamState as BeamState
 from instrument.checked import checked
-from instrument.errors import BeamStateError, InputError
+from instrument.errors import BeamStateError, FileError, InputError
 from instrument.jones import mueller
 from instrument.jones.base import JonesTerm
 from instrument.jones.chain import Chain
@@ -45,6 +46,10 @@ class VisibilitySet(ABC):
         for block in self.blocks():
             zeros = np.broadcast_to(np.zeros((), complex), block.data.shape)
             yield replace(block, data=zeros, weight=block.effective_weight)
+
+    def save(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
+        """Write the blocks one by one to an HDF5 file, whole or not at all, which `Visibilities.open` reads."""
+        store.write(path, self.blocks(), overwrite)
 
 
 def _ones() -> Float:
@@ -149,6 +154,25 @@ class Visibilities(VisibilitySet):
         if self.given_uvw_m is None:
             return self.at.uvw_m
         return stations_of(self.given_uvw_m, self.antenna1, self.antenna2, len(self.layout))
+
+    @classmethod
+    def open(
+        cls, path: str | os.PathLike[str], times: slice = slice(None), channels: slice = slice(None)
+    ) -> Visibilities:
+        """Visibilities that `save` has written, or some times and channels of them, as they were to the last bit.
+
+        `VisibilityFile(path)` gives them block by block. Raises `FileError` for other files, in one line.
+        """
+        return cls.of(store.Store(path), times, channels)
+
+    @classmethod
+    def of(cls, file: store.Store, times: slice, channels: slice) -> Visibilities:
+        """Some times and channels of an opened file."""
+        found = file.arguments(times, channels)
+        try:
+            return cls(**found)
+        except InputError as error:
+            raise FileError(f"{file.name}: {error}") from None
 
     def blocks(self) -> Iterator[Visibilities]:
         """One block: these."""

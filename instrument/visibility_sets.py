@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator
 
+from instrument.checked import checked
 from instrument.errors import InputError
+from instrument.store import Store
+from instrument.units import Float
 from instrument.visibilities import Visibilities, VisibilitySet
+
+BLOCK_BYTES = 64e6  # of a file that are read at once
 
 
 def as_set(given: VisibilitySet | Iterable[Visibilities], twice: str = "") -> VisibilitySet:
@@ -23,6 +29,38 @@ def as_set(given: VisibilitySet | Iterable[Visibilities], twice: str = "") -> Vi
 
 
 REMEDY = "these blocks can be gone through once: give the plan itself, a list of blocks, or a file of them"
+
+
+@checked
+class VisibilityFile(VisibilitySet):
+    """A file that `save` has written, as blocks: nothing but coordinates is held.
+
+    `Visibilities.open` reads some times and channels, or all of them, at once.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.store = Store(path)
+
+    def __repr__(self) -> str:
+        times, channels, baselines = self.store.shape
+        return (
+            f"VisibilityFile({self.store.name}: {times} times, {channels} channels, {baselines} baselines, "
+            f"{len(self.store.layout)} stations, {self.store.beam_state})"
+        )
+
+    @property
+    def freq_hz(self) -> Float:
+        """Channel centres, Hz (F,)."""
+        return self.store.freq_hz
+
+    def blocks(self) -> Iterator[Visibilities]:
+        """Blocks of at most 64 MB of data, in order of time; all channels, where one integration of them is smaller."""
+        times, channels, baselines = self.store.shape
+        some = int(max(1, min(channels, BLOCK_BYTES // (64 * baselines))))
+        slots = int(max(1, BLOCK_BYTES // (64 * baselines * channels)))
+        for t in range(0, times, slots):
+            for f in range(0, channels, some):
+                yield Visibilities.of(self.store, slice(t, t + slots), slice(f, f + some))
 
 
 class _Blocks(VisibilitySet):

@@ -10,12 +10,16 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from instrument.errors import FileError
+from instrument.errors import FileError, InputError
+from instrument.provenance import written_by
 
 
 @contextmanager
-def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+def whole_file(path: str | os.PathLike[str], overwrite: bool = False) -> Iterator[Path]:
     """Gives a path to write to; it becomes `path` when what is inside succeeds, and is removed when it does not.
+
+    Raises `InputError` for what exists, before anything is done and at the end, unless `overwrite` is given: the one
+    rule of every writer. A folder is never overwritten.
 
     The path lies in a new folder of a random name that only its owner may enter: nobody can have put a link to
     another file in its place. A link at `path` itself is replaced, not followed. What the system says against writing
@@ -23,9 +27,11 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     target = Path(path)
     private: Path | None = None
+    _free(target, overwrite)
     try:
         private = Path(tempfile.mkdtemp(prefix=".partial-", dir=target.parent))
         yield private / target.name
+        _free(target, overwrite)  # it may have come meanwhile
         (private / target.name).replace(target)
     except OSError as error:
         why = error.strerror or str(error).partition("\n")[0] or type(error).__name__
@@ -35,7 +41,15 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
             shutil.rmtree(private, ignore_errors=True)
 
 
-def write_ecsv(table: Any, path: str | os.PathLike[str]) -> None:
-    """Write an astropy table as ECSV, whole or not at all."""
-    with whole_file(path) as partial:
+def _free(target: Path, overwrite: bool) -> None:
+    if os.path.lexists(target) and (not overwrite or (target.is_dir() and not target.is_symlink())):
+        remedy = "choose another name" if target.is_dir() else "give overwrite=True, or another name"
+        raise InputError(f"{target} exists: {remedy}")
+
+
+def write_ecsv(table: Any, path: str | os.PathLike[str], overwrite: bool = False) -> None:
+    """Write an astropy table as ECSV with its provenance, whole or not at all; see `whole_file`."""
+    table = table.copy(copy_data=False)
+    table.meta["provenance"] = written_by()
+    with whole_file(path, overwrite) as partial:
         table.write(str(partial), format="ascii.ecsv", overwrite=True)

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from instrument import h5
 from instrument.errors import FileError
-from instrument.files import h5
-from instrument.files.h5 import one_line as one_line
 from instrument.files_in import harmless
+from instrument.h5 import one_line as one_line
 from instrument.units import Float
 
 POLS: dict[str, tuple[str, ...]] = {

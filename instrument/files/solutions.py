@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from datetime import UTC, datetime
-from importlib import metadata
 from typing import Any, Literal
 
 import numpy as np
@@ -24,6 +22,7 @@ from instrument.jones.lookup import nearest
 from instrument.jones.table import JonesTable
 from instrument.observe.layout import Layout
 from instrument.observe.sampling import Sampling
+from instrument.provenance import written_by
 from instrument.units import Complex, Float, direction
 from instrument.whole_file import whole_file
 
@@ -37,6 +36,7 @@ def write_h5parm(
     pattern: Pattern = "full",
     at: Sampling | None = None,
     directions: Mapping[str, Any] | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Write a solution as h5parm; `at` (such as `vis.at`) lends names and positions of stations and the phase centre.
 
@@ -62,15 +62,16 @@ def write_h5parm(
     axes = [axis for axis in AXES if there[axis]]
     weight = np.broadcast_to(usable[..., None], gains.shape).astype(np.float32)
     parts = {"amplitude": np.abs(gains), "phase": np.where(np.isfinite(gains), np.angle(gains), np.nan)}
-    now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S")
-    history = f"{now}: CREATE by instrument {metadata.version('instrument')}"
+    said = written_by()
+    known = ", ".join(f"{name} {value}" for name, value in said.items() if name not in ("written", "software"))
+    history = f"{said['written']}: CREATE by {said['software']}{known and f' ({known})'}"
     if not isinstance(solution, JonesTable):
         history += f"\n{solution}"
     sources = _sources(clusters if there["dir"] else {"POINTING": None}, at, directions)
 
     import h5py
 
-    with whole_file(path) as partial, h5py.File(partial, "w") as store:
+    with whole_file(path, overwrite) as partial, h5py.File(partial, "w") as store:
         solset = store.create_group("sol000")
         solset.attrs["h5parm_version"] = np.bytes_("1.0")
         solset["antenna"], solset["source"] = _antenna(names, at), sources

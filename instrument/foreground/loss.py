@@ -74,9 +74,9 @@ class SignalLoss:
         out.meta |= {"remover": self.remover, "stokes": self.stokes}
         return out
 
-    def write(self, path: str | os.PathLike[str]) -> None:
+    def write(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
         """Write the table as ECSV; the file is whole or not there."""
-        write_ecsv(self.table(), path)
+        write_ecsv(self.table(), path, overwrite)
 
 
 @checked

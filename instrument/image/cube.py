@@ -228,13 +228,13 @@ class StokesCube:
         # what is one value here was looked at when the cube was made
         return StokesCube(frequencies=freq * u.Hz, pixel=self.pixel_rad * u.rad, constants="data", **given)
 
-    def write(self, path: str | os.PathLike[str]) -> None:
+    def write(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
         """Write a FITS cube in float32 (Stokes and frequency axes, IAU polarization, restoring beam), whole or not.
 
         Beams of many channels are in a table BEAMS; frequencies that are not even make an axis FREQ-TAB with its table
         (FITS paper III), which programs that know it not refuse rather than misread. `read_cube` reads both back.
         """
-        write_cube(self, path)
+        write_cube(self, path, overwrite)
 
 
 def _images(data: Any, unit: str) -> Any:

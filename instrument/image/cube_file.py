@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from instrument.provenance import fits_cards
 from instrument.whole_file import whole_file
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 TABLE = "FREQS"  # of the frequencies of an axis FREQ-TAB
 
 
-def write_cube(cube: StokesCube, path: str | os.PathLike[str]) -> None:
+def write_cube(cube: StokesCube, path: str | os.PathLike[str], overwrite: bool = False) -> None:
     """Write a FITS cube in float32, whole or not at all; see `StokesCube.write`."""
     from astropy.io import fits
 
@@ -32,6 +33,7 @@ def write_cube(cube: StokesCube, path: str | os.PathLike[str]) -> None:
     header["BUNIT"] = cube.unit
     header["POLCCONV"] = ("IAU", "U and V: x north, y east, V right-handed")
     header["ORIGIN"] = "instrument"
+    header.extend(fits_cards(), update=True)
     if cube.centre is None:
         header["NOCENTRE"] = (True, "the centre is not known: 0, 0 stands for it")
     hdus = [fits.PrimaryHDU(np.asarray(cube.data, np.float32), header=header)]
@@ -48,5 +50,5 @@ def write_cube(cube: StokesCube, path: str | os.PathLike[str]) -> None:
         columns = [fits.Column("FREQ", "D", "Hz", array=freq)]
         columns += [fits.Column(name, "D", "deg", array=np.rad2deg(x)) for name, x in widths.items()]
         hdus.append(fits.BinTableHDU.from_columns(columns, name="BEAMS"))
-    with whole_file(path) as partial:
+    with whole_file(path, overwrite) as partial:
         fits.HDUList(hdus).writeto(partial, overwrite=True)

@@ -228,7 +228,7 @@ WRITTEN = (
 UNWRITABLE = re.compile(r"[,'\"\[\]\n\r]|^\s|\s$|^#|^$|^format\s*=", re.IGNORECASE)
 
 
-def write_bbs(path: Any, sky: PointSky) -> None:
+def write_bbs(path: Any, sky: PointSky, overwrite: bool = False) -> None:
     """Write a sky as BBS text that `read_bbs` (and DP3) read back; raises `InputError` for what the format cannot hold.
 
     Values are written with all their digits, positions in degrees, orientations as absolute ones. A patch stands at
@@ -242,7 +242,7 @@ def write_bbs(path: Any, sky: PointSky) -> None:
         middle = sky.select([k for k, p in enumerate(sky.patches) if p == patch]).middle
         out.append(f", , {patch}, {_degrees(middle.ra_rad)}, {_degrees(middle.dec_rad)}")
     out += [", ".join(row[k] for k in used) for row in rows]
-    with whole_file(path) as partial:
+    with whole_file(path, overwrite) as partial:
         partial.write_text("\n".join(out) + "\n", encoding="utf-8")
 
 

@@ -134,6 +134,6 @@ def test_what_cannot_be_written_whole_is_not_written(tmp_path, bbs, monkeypatch)
     target.write_text("before")
     monkeypatch.setattr("pathlib.Path.write_text", lambda *a, **k: (_ for _ in ()).throw(OSError(28, "disk full")))
     with pytest.raises(FileError, match="disk full"):
-        write_bbs(target, sky)
+        write_bbs(target, sky, overwrite=True)
     assert target.read_text() == "before"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["m.skymodel", "w.skymodel"]

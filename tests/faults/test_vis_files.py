@@ -3,6 +3,7 @@
 import os
 import tracemalloc
 from dataclasses import replace
+from typing import ClassVar
 
 import h5py
 import numpy as np
@@ -53,7 +54,7 @@ def test_i10_a_link_at_a_temporary_name_is_not_followed(tmp_path):
 def test_i10_the_place_of_a_temporary_file_is_new_private_and_random(tmp_path):
     seen = []
     for _ in range(2):
-        with whole_file(tmp_path / "a.txt") as partial:
+        with whole_file(tmp_path / "a.txt", overwrite=True) as partial:
             seen.append(partial)
             assert partial.name == "a.txt"  # the ending tells libraries the format
             assert not partial.exists()
@@ -67,7 +68,7 @@ def test_i10_a_link_at_the_name_itself_is_replaced_and_not_followed(tmp_path):
     victim = tmp_path / "victim"
     victim.write_text("precious")
     (tmp_path / "a.txt").symlink_to(victim)
-    with whole_file(tmp_path / "a.txt") as partial:
+    with whole_file(tmp_path / "a.txt", overwrite=True) as partial:
         partial.write_text("new")
     assert victim.read_text() == "precious"
     assert (tmp_path / "a.txt").read_text() == "new" and not (tmp_path / "a.txt").is_symlink()
@@ -84,6 +85,11 @@ def test_i7_what_the_system_says_against_writing_is_one_line(tmp_path, name):
 
 def test_i7_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, monkeypatch):
     class Full:
+        meta: ClassVar = {}
+
+        def copy(self, **_):
+            return self
+
         def write(self, name, **_):
             with open(name, "w") as file:
                 file.write("half")

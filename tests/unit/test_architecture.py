@@ -22,9 +22,11 @@ HEAVY = {"astropy", "scipy", "numba", "matplotlib", "ducc0", "h5py", "jinja2", "
 # stands for a module or for a whole package.
 LAYERS = (
     ("errors", "data", "scenes"),
-    ("numbers", "compiled", "terminal", "whole_file"),
+    ("numbers", "compiled", "terminal", "provenance"),
+    ("whole_file",),
     ("units", "checked"),
     ("files_in", "memory"),
+    ("h5",),
     ("registry", "mat2", "phasor"),
     ("component",),
     ("plugin_settings",),
@@ -32,6 +34,7 @@ LAYERS = (
     ("jones",),
     ("sky", "model"),
     ("beam_state", "visibility_checks"),
+    ("store",),
     ("visibilities",),
     ("visibility_sets",),
     ("predict",),

@@ -132,7 +132,7 @@ class FaradayCube:
 
         return find_peaks(self, snr, noise)
 
-    def write(self, path: str | os.PathLike[str]) -> None:
+    def write(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
         """Write a FITS cube (axes RA, DEC, FDEP in rad/m², Stokes Q and U or real and imaginary part), with its tables.
 
         RMSF, CHANNELS and DEPTHS are tables; depths that are not evenly spaced are numbered on the axis and listed in
@@ -140,4 +140,4 @@ class FaradayCube:
         """
         from instrument.analyze.faraday.file import write_faraday
 
-        write_faraday(self, path)
+        write_faraday(self, path, overwrite)

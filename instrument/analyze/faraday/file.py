@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from instrument.provenance import fits_cards
 from instrument.units import Direction
 from instrument.whole_file import whole_file
 
@@ -30,7 +31,7 @@ def sky_header(cube: FaradayCube) -> Any:
     return header
 
 
-def write_faraday(cube: FaradayCube, path: str | os.PathLike[str]) -> None:
+def write_faraday(cube: FaradayCube, path: str | os.PathLike[str], overwrite: bool = False) -> None:
     """Write a cube; see `FaradayCube.write`."""
     from astropy.io import fits
 
@@ -58,6 +59,7 @@ def write_faraday(cube: FaradayCube, path: str | os.PathLike[str]) -> None:
     if cube.noise is not None:
         head["NOISE"] = (cube.noise, "of real and imaginary part")
     head["ORIGIN"] = "instrument"
+    head.extend(fits_cards(), update=True)
     rmsf = [
         fits.Column("FDEP", "D", "rad/m2", array=cube.rmsf_depths),
         fits.Column("RMSF", "M", array=cube.rmsf),
@@ -68,7 +70,7 @@ def write_faraday(cube: FaradayCube, path: str | os.PathLike[str]) -> None:
         fits.Column("WEIGHT", "D", array=cube.weights),
     ]
     depths = [fits.Column("FDEP", "D", "rad/m2", array=cube.depths)]
-    with whole_file(path) as partial:
+    with whole_file(path, overwrite) as partial:
         stream = fits.StreamingHDU(str(partial), head)
         for part in ("real", "imag"):
             for plane in cube.data:

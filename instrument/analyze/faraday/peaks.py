@@ -14,6 +14,7 @@ from instrument.analyze.faraday.chunks import in_threads
 from instrument.analyze.faraday.cube import FaradayCube
 from instrument.analyze.faraday.kernels import brightest, summit
 from instrument.errors import InputError
+from instrument.provenance import fits_cards
 from instrument.units import Bool, Float, Int
 from instrument.whole_file import whole_file
 
@@ -58,21 +59,21 @@ class FaradayPeaks:
     lambda2_0: float
     snr_min: float
 
-    def write(self, path: str | os.PathLike[str], cube: FaradayCube) -> None:
+    def write(self, path: str | os.PathLike[str], cube: FaradayCube, overwrite: bool = False) -> None:
         """Write the maps as images of a FITS file, with the coordinates of the cube; whole or not there."""
         from astropy.io import fits
 
         from instrument.analyze.faraday.file import sky_header
 
         units = {"depth": "rad/m2", "depth_error": "rad/m2", "snr": "", "significant": "", "edge": "", "ambiguous": ""}
-        hdus: list[Any] = [fits.PrimaryHDU()]
+        hdus: list[Any] = [fits.PrimaryHDU(header=fits.Header(fits_cards()))]
         names = ("depth", "depth_error", "peak", "polarized", "angle_0", "angle_0_error", "angle", "angle_error")
         for name in (*names, "snr", "noise", "significant", "edge", "ambiguous"):
             header = sky_header(cube)
             header["BUNIT"] = units.get(name, "rad" if name.startswith("angle") else self.unit)
             header["LAMSQ0"] = (self.lambda2_0, "m2")
             hdus.append(fits.ImageHDU(getattr(self, name).astype(np.float32), header, name=name.upper()))
-        with whole_file(path) as partial:
+        with whole_file(path, overwrite) as partial:
             fits.HDUList(hdus).writeto(partial, overwrite=True)
 
 

@@ -50,9 +50,9 @@ class _Spectrum(ABC):
     def table(self) -> Any:
         """Everything as an astropy table, one row a bin, with units."""
 
-    def write(self, path: str | os.PathLike[str]) -> None:
+    def write(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
         """Write the table as ECSV; the file is whole or not there."""
-        write_ecsv(self.table(), path)
+        write_ecsv(self.table(), path, overwrite)
 
 
 @checked

@@ -79,9 +79,9 @@ class Spectrum2D:
         out.meta |= {"uv_range": list(self.uv_range) if self.uv_range else None, "missing": self.missing}
         return out
 
-    def write(self, path: str | os.PathLike[str]) -> None:
+    def write(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
         """Write the table as ECSV; the file is whole or not there."""
-        write_ecsv(self.table(), path)
+        write_ecsv(self.table(), path, overwrite)
 
 
 def ratio(a: Spectrum2D, b: Spectrum2D) -> Float:

@@ -131,9 +131,9 @@ class EoRWindow:
         out.meta |= {"model": self.model.name, "model_redshift": self.model.redshift}
         return out
 
-    def write(self, path: str | os.PathLike[str]) -> None:
+    def write(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
         """Write the table as ECSV; the file is whole or not there."""
-        write_ecsv(self.table(), path)
+        write_ecsv(self.table(), path, overwrite)
 
 
 def eor_window(

@@ -117,9 +117,9 @@ class Leakage:
         out.meta["frequency_hz"] = self.freq_hz
         return out
 
-    def write(self, path: str | os.PathLike[str]) -> None:
+    def write(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
         """Write the table as ECSV."""
-        write_ecsv(self.table(), path)
+        write_ecsv(self.table(), path, overwrite)
 
     def rings(self, edges_deg: tuple[float, ...] = (0.1, 1, 2, 3, 4, 5)) -> list[dict[str, float]]:
         """Median and maximum leakage of measured sources in rings about the centre, the first within the first edge."""

@@ -73,7 +73,7 @@ def members(group: Any) -> dict[str, Any]:
     return out
 
 
-def dataset(group: Any, name: str) -> Any:
+def dataset(group: Any, name: str, kinds: str = "fiuSUO") -> Any:
     """A dataset of numbers or text that is all in this file, not yet read; raises `FileError` for anything else."""
     import h5py
 
@@ -85,7 +85,7 @@ def dataset(group: Any, name: str) -> Any:
         raise FileError(f"{where}: '{name}' is a group, needed an array")
     if found.is_virtual or found.external:
         raise FileError(f"{where}: '{name}' lies in other files, which are not opened; copy it in (h5repack)")
-    if found.shape is None or found.dtype.kind not in "fiuSUO":
+    if found.shape is None or found.dtype.kind not in kinds:
         raise FileError(f"{where}: '{name}' holds {found.dtype}, needed an array of numbers or names")
     return found
 
