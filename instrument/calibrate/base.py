@@ -6,7 +6,7 @@ from abc import abstractmethod
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from instrument.jones.chain import Chain
 from instrument.jones.table import JonesTable
 from instrument.observe.intervals import Intervals
 from instrument.observe.sampling import Sampling
-from instrument.units import Bool, Complex, Float, Int
+from instrument.units import Bool, Complex, Float, Int, Real
 from instrument.visibilities import Visibilities
 
 
@@ -136,11 +136,22 @@ class Solution:
 
 @checked
 class Calibrator(Component):
-    """A solver: `solve(data, model)` finds the station terms that turn the model into the data."""
+    """A solver: `solve(data, model)` finds the station terms that turn the model into the data.
+
+    It stops when no station's matrix changes by more than `tolerance` of itself; a fit that leaves more than
+    `unexplained` of the rms of the data is no solution. `calibrate.judged` makes a `Solution` of the matrices found.
+    """
+
+    plugin_kind: ClassVar[str | None] = "calibrators"
+    tolerance: Annotated[float, Real(above=0, below=0.1)] = 1e-8
+    unexplained: Annotated[float, Real(above=0, at_most=1)] = 0.5
 
     @abstractmethod
-    def solve(self, data: Visibilities, model: Visibilities) -> Solution:
-        """Solve every interval; raises `InputError` only for input that cannot be paired."""
+    def solve(self, data: Visibilities, model: Visibilities, /) -> Solution:
+        """Solve every interval; raises `InputError` only for input that cannot be paired.
+
+        Flagged and non-finite data weigh nothing; an interval that is not fitted is not CONVERGED, and NaN.
+        """
 
 
 def pair(data: Visibilities, model: Visibilities) -> tuple[Complex, Complex, Float]:

@@ -7,7 +7,7 @@ import os
 from collections.abc import Collection, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, overload
 
 import numpy as np
 from pydantic import BeforeValidator
@@ -23,6 +23,7 @@ from instrument.predict.threads import ONE_THREAD, look_again
 from instrument.units import Bool, Complex, Count, Float, Int, Metres, Positive, PositiveSeconds, Real, to_si
 from instrument.visibilities import Visibilities
 
+ALL = "all"  # the cluster of a model that is not in parts
 Models = Mapping[str, Visibilities]
 
 
@@ -115,8 +116,22 @@ class DirectionalCal(Calibrator):
     unexplained: Annotated[float, Real(above=0, at_most=1)] = 0.7
     start: JonesTerm | None = None
 
-    def solve(self, data: Visibilities, models: Models) -> DirectionalSolution:  # type: ignore[override]
-        """Solve every interval; flagged and non-finite data weigh nothing. `models`: one `Visibilities` per cluster."""
+    @overload
+    def solve(self, data: Visibilities, models: Visibilities) -> Solution: ...
+
+    @overload
+    def solve(self, data: Visibilities, models: Models) -> DirectionalSolution: ...
+
+    def solve(self, data: Visibilities, models: Visibilities | Models) -> Solution | DirectionalSolution:
+        """Solve every interval; flagged and non-finite data weigh nothing.
+
+        `models`: one `Visibilities` per cluster, by name; or one alone, the same matrices for all of it.
+        """
+        if isinstance(models, Visibilities):
+            return self._solved(data, {ALL: models})[ALL]
+        return self._solved(data, models)
+
+    def _solved(self, data: Visibilities, models: Models) -> DirectionalSolution:
         names = self._names(models)
         with np.errstate(invalid="ignore"):  # data may hold infinities
             paired = [pair(data, models[name]) for name in names]

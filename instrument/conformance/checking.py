@@ -12,8 +12,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from instrument.calibrate.base import Calibrator
 from instrument.component import Component
-from instrument.conformance import engines, foregrounds, instruments, skies, stages, terms
+from instrument.conformance import calibrators, engines, foregrounds, instruments, skies, stages, terms
 from instrument.conformance.bench import Broken, bench, demand, fresh, problems
 from instrument.errors import InputError, InstrumentError, InstrumentWarning
 from instrument.foreground.base import ForegroundRemover
@@ -63,7 +64,7 @@ class Report:
 
 
 def check(obj: object, at: Sampling | None = None) -> Report:
-    """Check a Jones term, an instrument, a sky, an engine, a remover or a stage against the contract of its kind.
+    """Check a Jones term, instrument, sky, engine, calibrator, remover or stage against the contract of its kind.
 
     `at` is where a term is evaluated and where a sky is placed, for those that fit one array only (tables per station);
     a small array of LOFAR-like stations otherwise. Raises `InputError` where there is no contract for such an object.
@@ -144,6 +145,12 @@ def _engine(engine: Predictor, at: Sampling | None) -> Iterator[Line]:
         yield _line(claim, engine, list(served.values())[-1])
 
 
+def _calibrator(calibrator: Calibrator, at: Sampling | None) -> Iterator[Line]:
+    yield _line(a_round_trip_through_json_gives_an_equal_object, calibrator, Calibrator)
+    for claim in calibrators.CLAIMS:
+        yield _line(claim, calibrator)
+
+
 def _remover(remover: ForegroundRemover, at: Sampling | None) -> Iterator[Line]:
     yield _line(a_round_trip_through_json_gives_an_equal_object, remover, ForegroundRemover)
     for claim in foregrounds.CLAIMS:
@@ -161,6 +168,7 @@ CONTRACTS: dict[type[Component], Callable[[Any, Sampling | None], Iterator[Line]
     Instrument: _instrument,
     Sky: _sky,
     Predictor: _engine,
+    Calibrator: _calibrator,
     ForegroundRemover: _remover,
     Stage: _stage,
 }

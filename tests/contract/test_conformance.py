@@ -61,6 +61,7 @@ SETTINGS: dict[tuple[str, ...], list[dict[str, Any]]] = {
         {"values": np.full((1, 1, 1, 2, 2), 0.5j), "slots_s": np.zeros(1), "freq_hz": np.zeros(1)},
     ],
     ("terms", "gain"): [{}, {"rms": 0.1}],
+    ("calibrators", "selfcal"): [{}],
     ("stages", "noise"): [{"sefd": 100 * u.Jy, "seed": 1}],
     ("stages", "calibrate"): [{"calibrator": instrument.SelfCal(tolerance=1e-8)}],
     ("stages", "calibrate.incomplete-model"): [{"laboratory": instrument.IncompleteModel(models=(1, 3))}],

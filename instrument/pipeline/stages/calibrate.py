@@ -10,18 +10,19 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 
 from instrument.analyze.analyzer import Analyzer
-from instrument.calibrate.base import Solution
+from instrument.calibrate.base import Calibrator, Solution
 from instrument.calibrate.di_errors import DIComparison, DISums
 from instrument.calibrate.selfcal import SelfCal
-from instrument.component import Component
+from instrument.component import KIND, Component
 from instrument.errors import InputError, Outcome, did_you_mean
 from instrument.files.solutions import write_h5parm
 from instrument.image.cube import StokesCube
 from instrument.image.dirty import Images
 from instrument.jones.chain import Chain
+from instrument.numbers import brief
 from instrument.pipeline.stage import Beside, Draw, Running, Stage, StageResult, StageRun
 from instrument.pipeline.stages.image import Image
-from instrument.registry import names
+from instrument.registry import load, names
 from instrument.report.page import Block, Card, Figures, Section, Table, Text, number
 from instrument.units import Float
 from instrument.visibilities import Visibilities
@@ -33,23 +34,23 @@ IMAGES = ("corrupted", "corrected", "corrupted - corrected", "corrected - model"
 class Calibrate(Stage):
     """Solves every block against what a perfect instrument sees, and corrects it.
 
-    The settings of the table are those of the solver.
+    `kind` is a calibrator; the other settings of the table are its own. Those of "selfcal" are:
     """
 
     after: ClassVar[tuple[str, ...]] = ("noise",)
     perfect: ClassVar[bool] = True
     settings_of: ClassVar[tuple[type[Component], ...]] = (SelfCal,)
-    calibrator: SelfCal
+    calibrator: Calibrator
 
     @classmethod
     def from_table(cls, settings: Mapping[str, Any], beside: Beside) -> Self:
         """The stage; the settings are those of the solver."""
-        kind = settings.get("kind")
-        if kind != "selfcal":
-            said = "needs 'kind'" if kind is None else f"kind = {kind!r}"
-            known = ["selfcal", *(n.partition(".")[2] for n in names("stages") if n.startswith("calibrate."))]
-            raise InputError(f"{said}: {did_you_mean(str(kind), known)}")
-        return cls(calibrator=SelfCal(**{key: value for key, value in settings.items() if key != "kind"}))
+        kind = settings.get(KIND)
+        if kind not in names("calibrators"):
+            said = "needs 'kind'" if kind is None else f"kind = {brief(kind)}"
+            laboratories = [name.partition(".")[2] for name in names("stages") if name.startswith("calibrate.")]
+            raise InputError(f"{said}: {did_you_mean(str(kind), [*names('calibrators'), *laboratories])}")
+        return cls(calibrator=load("calibrators", kind, **{k: v for k, v in settings.items() if k != KIND}))
 
     def start(self, run: Running) -> StageRun:
         """The stage at work."""
@@ -62,7 +63,7 @@ class Calibrate(Stage):
 class _CalibrateRun(StageRun):
     """Keeps solutions, sums of errors, and difference images."""
 
-    solver: SelfCal
+    solver: Calibrator
     run: Running
     images: dict[str, Images]
     parts: list[Solution] = field(default_factory=list)
