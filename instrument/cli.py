@@ -28,6 +28,7 @@ def parser() -> argparse.ArgumentParser:
         prog="instrument",
         description="A radio interferometer composed of Jones terms, and its errors followed the whole way.",
     )
+    top.add_argument("--version", action="version", version=f"instrument {_version()}", help="print the version")
     verbs = top.add_subparsers(dest="verb", metavar="VERB", required=True, parser_class=_Parser)
 
     def scene_verb(name: str, text: str) -> argparse.ArgumentParser:
@@ -50,7 +51,7 @@ def parser() -> argparse.ArgumentParser:
         return verb
 
     run = scene_verb("run", "Run a scene end to end and write a run folder.")
-    run.add_argument("--out", metavar="DIR", help="folder to write (default: runs/NAME); must not exist or be empty")
+    _add_out(run)
     run.add_argument("--no-verify", action="store_true", help="leave out the check against the direct sum")
     scene_verb("plan", "Say what would be done, left out, and at what cost; nothing is computed.")
     _add_analyze(verbs)
@@ -61,11 +62,27 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
+def _version() -> str:
+    from instrument import __version__
+
+    return __version__
+
+
+def _add_out(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument(
+        "--out",
+        metavar="DIR",
+        help="folder to write, new or empty (default: runs/NAME, or NAME-2, NAME-3, ... where that is taken); nothing "
+        "that is there is overwritten",
+    )
+    verb.add_argument("--force", action="store_true", help="replace an earlier run in that folder")
+
+
 def _add_analyze(verbs: Any) -> None:
     text = "Faraday depth, power spectra, foreground removal and EoR window of FITS cubes."
     verb = verbs.add_parser("analyze", help=text, description=text)
     verb.add_argument("files", metavar="CUBE.fits", nargs="+", help="FITS cubes, together or one for each Stokes")
-    verb.add_argument("--out", metavar="DIR", help="folder to write (default: runs/NAME); must not exist or be empty")
+    _add_out(verb)
     verb.add_argument(
         "--products", metavar="A,B", help="faraday, spectrum-2d, cylindrical, spherical, window (default: all possible)"
     )
@@ -159,6 +176,7 @@ def _run(given: argparse.Namespace) -> int:
         workers=given.workers,
         verify=not given.no_verify,
         show=show,
+        force=given.force,
     )
     return DONE if result.passed else FELL_SHORT
 
@@ -195,7 +213,8 @@ def _analyze(given: argparse.Namespace) -> int:
     settings = CubeAnalysis(remover=override({}, given.remover), cubes=given.cubes, clean=given.clean, **fields)
     names = ("stokes", "unit", "beam", "frequencies", "psf", "flag_channels", "band", "common_beam", "weights", "noise")
     reading = Reading(**{name: getattr(given, name) for name in names})
-    result = analyze_files(given.files, settings, reading, given.out, shlex.join(["instrument", *given.words]), show)
+    command = shlex.join(["instrument", *given.words])
+    result = analyze_files(given.files, settings, reading, given.out, command, show, given.force)
     return DONE if result.passed else FELL_SHORT
 
 

@@ -8,7 +8,7 @@ import json
 import re
 import sys
 from abc import ABC
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from difflib import get_close_matches
 from types import UnionType
 from typing import Any, ClassVar, Self, Union, get_args, get_origin
@@ -24,11 +24,13 @@ from pydantic import (
     model_serializer,
     model_validator,
 )
+from pydantic.fields import FieldInfo
 
 from instrument.checked import checked
 from instrument.errors import InputError, did_you_mean
 from instrument.numbers import Index, brief
 from instrument.registry import load, plugin_class, plugin_name
+from instrument.shown import represented, unit_of
 
 KIND = "kind"  # the key under which text names a class: a plugin by its name, another component by its class name
 OLD_TAG = "component"  # "module:Class", written until 2026-11; understood for classes that are known, never imported
@@ -123,6 +125,19 @@ class Component(BaseModel, ABC):
         text = re.sub(r"(?<!\w)-0\.0(?!\d)", "0.0", self.to_json())
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
+    def __repr__(self) -> str:
+        return represented(type(self).__name__, self._shown())
+
+    def __str__(self) -> str:
+        return repr(self)
+
+    def _shown(self) -> Iterator[tuple[str, Any, str]]:
+        """Name, value and unit of every field that is not its default."""
+        for name, info in type(self).model_fields.items():
+            value = getattr(self, name)
+            if info.is_required() or not _same(value, info.get_default(call_default_factory=True)):
+                yield info.alias or name, value, _unit(info) or unit_of(name)
+
     def __eq__(self, other: object) -> bool:
         if type(other) is not type(self):
             return NotImplemented
@@ -140,16 +155,20 @@ class Component(BaseModel, ABC):
 
 def _at_the_door(cls: type[Component], name: str, value: Any) -> Any:
     """A stored SI value as it would be given: with its unit."""
+    unit = _unit(cls.model_fields[name])
+    if value is None or unit is None:
+        return value
+    from astropy import units as u
+
+    return u.Quantity(value, unit)
+
+
+def _unit(info: FieldInfo) -> str | None:
+    """The unit that a field is stored in, if it has one ("" has no dimension)."""
     from instrument.units import In
 
-    info = cls.model_fields[name]
     inner = [mark for option in get_args(info.annotation) for mark in getattr(option, "__metadata__", ())]  # X | None
-    for mark in (*info.metadata, *inner):
-        if isinstance(mark, In) and value is not None:
-            from astropy import units as u
-
-            return u.Quantity(value, mark.unit)
-    return value
+    return next((mark.unit for mark in (*info.metadata, *inner) if isinstance(mark, In)), None)
 
 
 def _same(a: Any, b: Any) -> bool:

@@ -21,6 +21,7 @@ NEEDED = (
     "pydantic",
     "numba",
     "ducc0",
+    "h5py",
     "threadpoolctl",
     "matplotlib",
     "jinja2",

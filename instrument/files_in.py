@@ -24,6 +24,17 @@ def harmless(text: Any, at_most: int | None = None) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in cut)
 
 
+def is_measurement_set(path: Any) -> bool:
+    """Whether a name is that of a Measurement Set, there or not: a folder with a table in it, or a name in .ms."""
+    try:
+        text = os.fspath(path)
+        folder = os.path.isdir(text)
+        named = str(text).rstrip("/").lower().endswith((".ms", ".measurementset"))
+        return (folder and os.path.isfile(os.path.join(text, "table.dat"))) or (named and not os.path.isfile(text))
+    except (OSError, ValueError, TypeError):  # a NUL in the name: who opens it says so
+        return False
+
+
 def open_regular(path: Any, limit_bytes: int | None = None, what: str = "file") -> BinaryIO:
     """A regular file opened for reading in binary; the caller closes it.
 
@@ -32,6 +43,11 @@ def open_regular(path: Any, limit_bytes: int | None = None, what: str = "file") 
     and for one of more than `limit_bytes`; a sparse file counts with the size that it declares.
     """
     shown = harmless(path)
+    if is_measurement_set(path):
+        raise FileError(
+            f"'{shown}' is a Measurement Set, which is not read yet: image it with WSClean or CASA and give the FITS "
+            "images to 'instrument analyze', or describe the observation in a scene file for 'instrument run'"
+        )
     try:
         # O_NONBLOCK and O_NOCTTY are not everywhere; O_BINARY is on Windows alone
         flags = os.O_RDONLY | sum(getattr(os, name, 0) for name in ("O_NONBLOCK", "O_NOCTTY", "O_CLOEXEC", "O_BINARY"))

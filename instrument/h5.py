@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from instrument.errors import FileError
-from instrument.files_in import harmless, open_regular
+from instrument.files_in import harmless, is_measurement_set, open_regular
 from instrument.units import si_prefix
 
 # What a file may declare in memory: h5parms are packed 50-fold where all is 1 or flagged; small files may do more
@@ -34,7 +34,7 @@ def opened(path: Any, what: str) -> Iterator[Any]:
     import h5py
 
     try:
-        if not os.path.exists(path):
+        if not os.path.exists(path) and not is_measurement_set(path):
             raise FileError(f"{harmless(path)} does not exist")
         name = harmless(os.path.basename(os.fspath(path)))
         try:

@@ -17,6 +17,7 @@ from instrument.errors import InputError, RefusedError
 from instrument.predict.base import Predictor, Prepared, Problem, Work
 from instrument.predict.direct import Direct
 from instrument.predict.threads import alone, look_again
+from instrument.shown import short_repr
 from instrument.units import si_prefix
 from instrument.visibilities import BeamState, Visibilities, VisibilitySet
 from instrument.visibility_sets import as_set
@@ -35,6 +36,7 @@ class Item(NamedTuple):
 class Plan(VisibilitySet):
     """What will be done. Print it; `run` it at once or take `blocks` one by one; `verify` it against the definition."""
 
+    __repr__ = short_repr
     name: str
     full: Problem  # as the scene has it: what `direct` would compute
     problem: Problem  # what is computed after the omissions
@@ -93,8 +95,8 @@ class Plan(VisibilitySet):
         stations, sources = self.full.at.shape[2:]
         head = (
             f"scene {self.name}: {count_of(stations, 'station')}, {count_of(baselines, 'baseline')}, "
-            f"{count_of(times, 'time')}, {count_of(channels, 'channel')}, {count_of(sources, 'direction')}, "
-            f"tolerance {self.tolerance:g}"
+            f"{count_of(times, 'time')}, {count_of(channels, 'channel')} ({band_of(self.full)}), "
+            f"{count_of(sources, 'direction')}, tolerance {self.tolerance:g}"
         )
         lines = [head]
         lines += [f"kept          {i.name:<22} {i.reason}" for i in self.kept]
@@ -222,6 +224,18 @@ class Plan(VisibilitySet):
     def _checker(self, samples: int, seed: int) -> Checker:
         against = BY_STATIONS if isinstance(self.engine, Direct) else DEFINITION
         return Checker(self.full, self.scale_jy, self.sum_bound, SHARE * self.seconds, samples, seed, against)
+
+
+def band_of(problem: Problem) -> str:
+    """The band, edge to edge, or from centre to centre where no width is known: "149.905 to 150.095 MHz"."""
+    half = (problem.width_hz or 0.0) / 2
+    low, high = problem.at.freq_hz.min() - half, problem.at.freq_hz.max() + half
+    return f"{_mhz(low)} MHz" if low == high else f"{_mhz(low)} to {_mhz(high)} MHz"
+
+
+def _mhz(freq_hz: float) -> str:
+    """To the nearest 100 Hz, without needless zeros."""
+    return f"{freq_hz / 1e6:.4f}".rstrip("0").rstrip(".")
 
 
 def count_of(n: int, what: str) -> str:

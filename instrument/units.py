@@ -318,6 +318,13 @@ def _write_instant(value: Any) -> str:
 Instant = Annotated[Any, BeforeValidator(_instant), PlainSerializer(_write_instant, return_type=str, when_used="json")]
 
 
+def mjd_text(seconds: float) -> str:
+    """MJD seconds, UTC, as text to 1 ms: "2012-12-07T20:00:00.000"."""
+    from astropy.time import Time
+
+    return str(Time(seconds // 86400, (seconds % 86400) / 86400, format="mjd", scale="utc").isot)
+
+
 def si_prefix(value: float, unit: str) -> str:
     """Three digits with a metric prefix: `7.2e10, 'Flop'` -> `72 GFlop`."""
     if not np.isfinite(value) or value == 0:

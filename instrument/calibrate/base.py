@@ -21,6 +21,7 @@ from instrument.jones.chain import Chain
 from instrument.jones.table import JonesTable
 from instrument.observe.intervals import Intervals
 from instrument.observe.sampling import Sampling
+from instrument.shown import short_repr
 from instrument.units import Bool, Complex, Float, Int, Real
 from instrument.visibilities import Visibilities
 
@@ -39,6 +40,7 @@ class Solution:
     baseline, times what J^-1 magnifies it by. `doubts` are sentences about all this, printed with a solution.
     """
 
+    __repr__ = short_repr
     term: JonesTable
     outcome: Any
     iterations: Int

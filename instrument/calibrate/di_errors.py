@@ -9,6 +9,7 @@ import numpy as np
 
 from instrument.calibrate.base import Solution
 from instrument.jones.mueller import DIErrors, di_errors, mueller
+from instrument.shown import short_repr
 from instrument.units import Complex, Int
 
 HELD = 16e6  # bytes of baselines compared at once
@@ -26,6 +27,7 @@ class DIComparison:
     dG. Each with the gauge as the solver left it ("raw") and with the best matrix of the gauge removed ("aligned").
     """
 
+    __repr__ = short_repr
     rms: float
     linear: dict[str, dict[str, float]]
     quadratic: dict[str, dict[str, float]]

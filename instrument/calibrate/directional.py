@@ -20,6 +20,7 @@ from instrument.errors import InputError, InstrumentError, Outcome, did_you_mean
 from instrument.jones.base import JonesTerm
 from instrument.jones.table import JonesTable
 from instrument.predict.threads import ONE_THREAD, look_again
+from instrument.shown import short_repr
 from instrument.units import Bool, Complex, Count, Float, Int, Metres, Positive, PositiveSeconds, Real, to_si
 from instrument.visibilities import Visibilities
 
@@ -31,6 +32,7 @@ Models = Mapping[str, Visibilities]
 class DirectionalSolution:
     """A `Solution` for each cluster, by name: `solution["3C196"].term` is the station term of that direction."""
 
+    __repr__ = short_repr
     clusters: dict[str, Solution]
 
     def __getitem__(self, name: str) -> Solution:

@@ -14,6 +14,7 @@ from instrument.analyze.sources.leakage import NULL
 from instrument.errors import InputError
 from instrument.image.cube import StokesCube
 from instrument.observe.directions import lmn, offset
+from instrument.shown import short_repr
 from instrument.sky.points import PointSky
 from instrument.units import Bool, Float, Int
 from instrument.whole_file import write_ecsv
@@ -40,6 +41,7 @@ class Sweep:
     image of perfectly calibrated data, `residuals` are those of the differences to it.
     """
 
+    __repr__ = short_repr
     models: tuple[int, ...]
     sources: int
     bright: int

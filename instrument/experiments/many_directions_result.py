@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from instrument.shown import short_repr
 from instrument.units import Float, Int
 from instrument.whole_file import write_ecsv
 
@@ -25,6 +26,7 @@ class ManyDirectionsResult:
     `one_*` are those of one direction for all. `failures` says how intervals failed.
     """
 
+    __repr__ = short_repr
     names: tuple[str, ...]
     sources: Int
     flux_jy: Float

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from abc import abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,11 +12,12 @@ from numpy.typing import NDArray
 
 from instrument.checked import checked
 from instrument.component import Component
-from instrument.errors import InputError, InstrumentWarning, Outcome
+from instrument.errors import InputError, Outcome, warn
 from instrument.foreground.linear import apply
 from instrument.foreground.score import Score, estimated_score, true_score
 from instrument.image.cube import StokesCube
 from instrument.numbers import squarable
+from instrument.shown import short_repr
 from instrument.units import Bool, Float, Int, Seed
 
 Plane = Literal["I", "Q", "U", "V"]
@@ -35,6 +35,7 @@ class Separation:
     is the posterior covariance of the foreground of a pixel, where there is one.
     """
 
+    __repr__ = short_repr
     outcome: Outcome
     remark: str
     mixing: Float
@@ -71,6 +72,7 @@ class Separation:
 class Clean:
     """One Stokes plane made fit: the maps of the channels in use (C, Ny, Nx), holes 0, and what was left out."""
 
+    __repr__ = short_repr
     maps: Any
     freq_hz: Float  # (C,)
     channels: Int  # of the cube (C,)
@@ -99,16 +101,14 @@ class Clean:
             for c in spoilt[~empty[spoilt]]:
                 low[c], high[c] = plane[c][good].min(), plane[c][good].max()
             infinite = sum(int(np.isinf(plane[c]).sum()) for c in finite)
-            warnings.warn(
+            warn(
                 f"{stokes}: {empty.sum()} of {len(plane)} channels and {(~good).sum()} of {good.size} lines of sight "
-                f"have NaN{f' ({infinite} voxels are infinite)' if infinite else ''}: left out, NaN in what comes back",
-                InstrumentWarning,
-                stacklevel=4,
+                f"have NaN{f' ({infinite} voxels are infinite)' if infinite else ''}: left out, NaN in what comes back"
             )
         flat = ~empty & (low == high)
         if flat.any():
             text = f"{stokes}: {flat.sum()} of {len(plane)} channels do not vary: left as they are"
-            warnings.warn(text, InstrumentWarning, stacklevel=4)
+            warn(text)
         use = np.flatnonzero(~(empty | flat))
         size = max((max(abs(float(low[c])), abs(float(high[c]))) for c in use), default=1.0)
         squarable(size, stokes)
@@ -274,7 +274,7 @@ class ForegroundRemover(Component):
         found = self.separate(clean.maps, clean.freq_hz)
         if found.mixing.shape[1] >= len(clean.channels):
             text = f"{found.mixing.shape[1]} components of {len(clean.channels)} channels are everything: residual 0"
-            warnings.warn(text, InstrumentWarning, stacklevel=2)
+            warn(text)
             found = replace(found, outcome=Outcome.SINGULAR, remark=f"{text}, which says nothing; ask for fewer")
         shown = found.of(clean.maps[:, :1]) if found.foreground is None else found.foreground
         if not np.isfinite(shown).all():

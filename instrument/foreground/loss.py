@@ -14,6 +14,7 @@ from instrument.checked import checked
 from instrument.errors import InputError
 from instrument.foreground.base import ForegroundRemover
 from instrument.image.cube import StokesCube
+from instrument.shown import short_repr
 from instrument.units import Float, Int
 from instrument.whole_file import write_ecsv
 
@@ -30,6 +31,7 @@ class SignalLoss:
     the square of the transfer. NaN where a bin is empty or the signal has less than 1e-9 of its power in another.
     """
 
+    __repr__ = short_repr
     remover: str  # as JSON
     k_perp: Float  # 1/Mpc (Np,)
     k_par: Float  # 1/Mpc (Nl,)

@@ -26,6 +26,7 @@ import numpy as np
 from instrument.analyze.power.fourier import comoving, line_of_sight, taper_of
 from instrument.errors import InputError
 from instrument.foreground.linear import apply, covariance, one_thread
+from instrument.shown import short_repr
 from instrument.units import Bool, Float
 
 NOISE_FROM = 0.3  # 1/Mpc: delays beyond it hold noise
@@ -51,6 +52,7 @@ class Score:
     removal would take away, in the power of the data at these delays.
     """
 
+    __repr__ = short_repr
     value: float
     sigma: float
     how: str

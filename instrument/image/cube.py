@@ -15,6 +15,7 @@ from instrument.image.channels import channel_index, in_band
 from instrument.image.common_beam import at_common_beam
 from instrument.image.cube_file import write_cube
 from instrument.observe.directions import LIGHT
+from instrument.shown import short_repr
 from instrument.units import Count, Direction, Float, one_si, to_si
 
 BOLTZMANN = 1.380649e-23  # J/K
@@ -32,6 +33,7 @@ class Psf:
     is None where only the widths are known, as in a FITS file.
     """
 
+    __repr__ = short_repr
     data: Float | None
     major_rad: Float
     minor_rad: Float
@@ -81,6 +83,7 @@ class StokesCube:
     Masked voxels become NaN; a `Quantity` is turned into `unit`.
     """
 
+    __repr__ = short_repr
     data: Float
     freq_hz: Float
     pixel_rad: float

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 
-from instrument.errors import InstrumentWarning
+from instrument.errors import warn
 from instrument.image.cube import Psf
 from instrument.units import Float
 
@@ -25,7 +23,7 @@ def fit_psf(data: Float, pixel_rad: float) -> Psf:
         (broken, "has no main lobe within the image: no beam is fitted; take a larger image or more baselines"),
     ):
         if np.any(trouble):
-            warnings.warn(f"the PSF {what}", InstrumentWarning, stacklevel=3)
+            warn(f"the PSF {what}")
     major, minor, angle = (np.where(broken, np.nan, x) for x in (major, minor, angle))
     return Psf(data, major * pixel_rad, minor * pixel_rad, angle, residual)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from typing import Any, Self
@@ -43,6 +44,9 @@ class Chain(Component):
 
     def __init__(self, *terms: JonesTerm, **fields: Any) -> None:
         super().__init__(**({"terms": terms} if terms else {}), **fields)
+
+    def _shown(self) -> Iterator[tuple[str, Any, str]]:
+        yield from (("", term, "") for term in self.terms)
 
     @model_validator(mode="after")
     def _bases_meet(self) -> Self:

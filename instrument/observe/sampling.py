@@ -12,6 +12,7 @@ from instrument.checked import checked
 from instrument.errors import InputError
 from instrument.observe.directions import EarthFrame, earth_frame, lmn, tangents
 from instrument.observe.layout import Layout
+from instrument.shown import short_repr
 from instrument.units import Direction, Float, instants, plain, unit_vectors
 
 
@@ -36,6 +37,7 @@ class Sampling:
     frames; `towards` drops the first two, which belong to the directions.
     """
 
+    __repr__ = short_repr
     layout: Layout
     earth: EarthFrame
     slots_s: Float  # (T,) MJD seconds, UTC: names an integration, used for interpolation and for seeds

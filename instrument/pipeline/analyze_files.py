@@ -23,6 +23,7 @@ from instrument.pipeline.progress import progress_bar
 from instrument.pipeline.record import json_text, versions
 from instrument.pipeline.stages.cube import CubeAnalysis
 from instrument.pipeline.stages.cube_results import CubeResults
+from instrument.provenance import provenance
 from instrument.units import Float
 
 OPTIONS = {  # what refusals ask for, as they do in Python and as it is written here
@@ -107,13 +108,14 @@ def analyze_files(
     out: str | None = None,
     command: str = "",
     show: Callable[[str], None] = lambda text: None,
+    force: bool = False,
 ) -> CubeResults:
     """Read cubes, analyze them and write a folder, whole or not at all; the results.
 
     Raises `InputError` before anything is computed when files or settings will not do, with the option that helps.
     """
     reading = reading or Reading()
-    folder = RunFolder(Path(paths[0]).name.split(".fits")[0], out)
+    folder = RunFolder(Path(paths[0]).name.split(".fits")[0], out, force)
     with unused_ledger() as ledger, _options():
         cube, weights = reading.cube(paths)
         quiet = reading.quiet(cube)
@@ -122,7 +124,7 @@ def analyze_files(
         settings.refusals(cube)
         with folder, progress_bar(f"analyze {paths[0]}") as update:
             result = settings.run(cube, quiet, update)
-            with result.timed("write"):
+            with result.timed("write"), provenance(object=Path(paths[0]).name):
                 _write(result, paths, command, folder.partial, ledger)
             path = folder.finish()
     spent = ", ".join(f"{name} {seconds:.1f}" for name, seconds in sorted(result.seconds.items(), key=lambda s: -s[1]))

@@ -21,11 +21,12 @@ class RunFolder:
 
     Inside, `partial` is where to write. Without `finish` nothing is left, not even folders made for it; what runs that
     were killed have left beside it is removed and named. `out=None` takes runs/NAME, or the next free name. Raises
-    `InputError` when the folder is not empty or cannot be made.
+    `InputError` when the folder is not empty or cannot be made. With `force` a run folder (it holds a run.json) that is
+    there is replaced, once everything is written; no other folder is.
     """
 
-    def __init__(self, name: str, out: str | None) -> None:
-        self._name, self._out = name.strip(".") or "run", out
+    def __init__(self, name: str, out: str | None, force: bool = False) -> None:
+        self._name, self._out, self._force = name.strip(".") or "run", out, force
         with self._one_line():
             self.path = self._free()
         self._made: list[Path] = []
@@ -57,6 +58,15 @@ class RunFolder:
     def finish(self) -> Path:
         """Move what was written to its place; the path, which is the next free one where another run took the name."""
         asked = self.path
+        if self._replaces(asked):
+            old = asked.rename(self.partial.with_name(f".old{self.partial.name}"))
+            try:
+                os.rename(self.partial, asked)
+            except OSError:
+                old.rename(asked)
+                raise
+            shutil.rmtree(old, ignore_errors=True)
+            return asked
         while True:
             try:
                 os.rename(self.partial, self.path)  # onto an empty folder, or where nothing is: in one step
@@ -69,15 +79,22 @@ class RunFolder:
             warn(f"{asked} was taken meanwhile: the results are in {self.path}")
         return self.path
 
+    def _replaces(self, folder: Path) -> bool:
+        """Whether an earlier run folder is there that may go."""
+        return self._force and folder.is_dir() and (folder / "run.json").is_file()
+
     def _free(self) -> Path:
         """The folder asked for, which must be empty, or the next free one under runs/."""
         if self._out is None:
-            return _next_free(Path("runs") / self._name)
+            usual = Path("runs") / self._name
+            return usual if self._replaces(usual) and not usual.is_symlink() else _next_free(usual)
         # a link is followed: its target is what is written
         folder = Path(os.path.realpath(Path(self._out).expanduser()))
         if folder.is_symlink():
             raise InputError(f"--out {self._out}: its links lead to one another; choose another")
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        if folder.exists() and not self._replaces(folder) and (not folder.is_dir() or any(folder.iterdir())):
+            if not self._force and (folder / "run.json").is_file():
+                raise InputError(f"--out {self._out}: there is a run in it; choose another, or replace it with --force")
             raise InputError(f"--out {self._out}: it exists and is not an empty folder; choose another")
         if folder.is_dir() and os.path.ismount(folder):
             raise InputError(

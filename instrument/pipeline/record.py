@@ -61,6 +61,7 @@ def record(result: Result, tables: dict[str, Any]) -> dict[str, Any]:
         "title": result.scene.title,
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "seed": result.scene.seed,
+        "scene_hash": result.scene.fingerprint(),
         "versions": versions(),
         "machine": {"system": platform.platform(), "workers": plan.workers},
         "scene": tables,

@@ -16,6 +16,7 @@ from instrument.pipeline.record import Result, json_text, record, summary
 from instrument.pipeline.scene_file import SceneFile
 from instrument.pipeline.scene_text import to_toml
 from instrument.pipeline.stage import EachBlock, Running, StageRun
+from instrument.provenance import provenance
 from instrument.visibilities import Visibilities
 
 PREDICT = "predict"
@@ -30,13 +31,14 @@ def run(
     workers: int | None = None,
     verify: bool = True,
     show: Callable[[str], None] = lambda text: None,
+    force: bool = False,
 ) -> Result:
     """Run a scene file and write its folder; everything is written beside it first and moved there at the end.
 
     `tables` are the TOML tables it was made from. Raises `InputError` before anything is computed or written when the
-    scene or the folder will not do.
+    scene or the folder will not do. With `force` an earlier run folder is replaced.
     """
-    folder = RunFolder(scene_file.name, out)
+    folder = RunFolder(scene_file.name, out, force)
     with unused_ledger() as ledger:
         result = _planned(scene_file, folder.path, memory, workers, verify)
         result.unused = ledger
@@ -46,7 +48,7 @@ def run(
             if verify:
                 result.check = result.plan.check
                 _book(result)
-            with result.timed("write"):
+            with result.timed("write"), provenance(**_known(result)):
                 _write(result, tables, folder.partial)
             result.folder = folder.finish()
     show(summary(result))
@@ -61,6 +63,15 @@ def _planned(scene_file: SceneFile, path: Path, memory: str | None, workers: int
     if verify:  # the blocks as the stages get them, before any corruption
         plan = plan.watched(samples=64, seed=scene_file.seed)
     return Result(scene_file, scene.instrument, plan, path, seconds={"plan": time.perf_counter() - begin})
+
+
+def _known(result: Result) -> dict[str, str | int]:
+    """What the files of a run say of it."""
+    from instrument.units import mjd_text
+
+    scene, problem = result.scene, result.plan.problem
+    start = mjd_text(float(problem.at.slots_s[0]) - problem.interval_s / 2)
+    return {"object": scene.name, "start": start, "seed": scene.seed, "scene": scene.fingerprint()}
 
 
 def _book(result: Result) -> None:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import zlib
 from dataclasses import replace
 from functools import cached_property
-from typing import Annotated, Any, Self
+from typing import Any, Self
 
-import numpy as np
 from pydantic import Field, model_validator
 
 from instrument.component import KIND, Component, class_of, public_name
@@ -16,59 +15,15 @@ from instrument.jones.base import JonesTerm
 from instrument.jones.feed import FeedTerm
 from instrument.jones.gain import GainTerm
 from instrument.model import Instrument
-from instrument.numbers import Seed, Tolerance, Whole, brief
-from instrument.observe.observation import Observation
+from instrument.numbers import Seed, Tolerance, brief
+from instrument.pipeline.observation_table import ObservationTable
 from instrument.pipeline.stage import SEED_STEP, Beside, Stage, in_order
 from instrument.plan import Item, Plan
 from instrument.registry import available, load, names, plugin_class
 from instrument.scene import Scene
 from instrument.sky.base import Sky
-from instrument.units import Float, Hertz, HertzArray, Instant, PositiveHertz, Seconds, SkyDirection
 
 MOST_CHANNELS = 1_000_000
-
-
-class Frequency(Component):
-    """Channels: `centre` of the band, `width` of one channel (also their spacing), how many."""
-
-    centre: PositiveHertz
-    width: PositiveHertz
-    channels: Annotated[int, Whole(at_least=1, at_most=MOST_CHANNELS)] = 1
-
-    def values_hz(self) -> Float:
-        """Channel centres, Hz (F,)."""
-        return np.asarray(self.centre + self.width * (np.arange(self.channels) - (self.channels - 1) / 2))
-
-
-class ObservationTable(Component):
-    """The table [observation]: an `Observation`, its channels as `frequency` or as a list `frequencies`."""
-
-    phase_centre: SkyDirection
-    start: Instant | None = None
-    transit: str | None = None
-    duration: Seconds
-    interval: Seconds
-    frequency: Frequency | None = None
-    frequencies: HertzArray | None = None
-    channel_width: Hertz | None = None
-
-    def observation(self) -> Observation:
-        """The observation it describes."""
-        from astropy import units as u
-
-        if (self.frequency is None) == (self.frequencies is None):
-            raise InputError("[observation] needs 'frequency' or 'frequencies', and not both")
-        values = self.frequency.values_hz() if self.frequency else self.frequencies
-        width = self.frequency.width if self.frequency else self.channel_width
-        return Observation(
-            phase_centre=self.phase_centre,
-            start=self.start,
-            transit=self.transit,
-            duration=self.duration * u.s,
-            interval=self.interval * u.s,
-            frequencies=np.asarray(values) * u.Hz,
-            channel_width=None if width is None else width * u.Hz,
-        )
 
 
 class SceneFile(Component):
@@ -100,9 +55,7 @@ class SceneFile(Component):
     @cached_property
     def stages(self) -> dict[str, Stage]:
         """Every stage that is there, by its table, in the order of the run."""
-        table = self.observation
-        width = table.frequency.width if table.frequency else table.channel_width
-        beside = Beside(self.seed, self.tables, width)
+        beside = Beside(self.seed, self.tables, self.observation.width_hz)
         return in_order({name: _stage(name, settings, beside) for name, settings in self.tables.items()})
 
     @property
@@ -197,8 +150,6 @@ class SceneFile(Component):
             given = [f"[{table}]" for table in self.tables if table not in taken]
             kind = self.tables[alone].get("kind", alone)
             unused("scene", given, f"a laboratory, [{alone}] kind = '{kind}', makes its own figures")
-        if self.observation.frequency is not None and self.observation.channel_width is not None:
-            unused("[observation]", ["channel_width"], "'frequency' has its width")
 
 
 def _terms(tables: Any, seed: int) -> tuple[JonesTerm, ...]:

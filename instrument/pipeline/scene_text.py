@@ -42,10 +42,10 @@ def shipped() -> dict[str, str]:
 
 def read_tables(scene: str | os.PathLike[str]) -> dict[str, Any]:
     """Tables of a scene file, or of the shipped scene of that name."""
-    from instrument.files_in import read_regular
+    from instrument.files_in import is_measurement_set, read_regular
 
     path = Path(scene)
-    if path.suffix == ".toml" or _is_there(path):
+    if path.suffix == ".toml" or _is_there(path) or is_measurement_set(path):
         return _tables(_decoded(read_regular(path, int(MOST_BYTES), "scene file"), str(path)), str(path))
     if str(scene) not in shipped():
         raise InputError(f"no scene is called '{scene}': {did_you_mean(str(scene), shipped())}; or give a .toml file")

@@ -14,6 +14,7 @@ from instrument.checked import checked
 from instrument.component import Component
 from instrument.jones.chain import Chain
 from instrument.observe.sampling import Sampling
+from instrument.shown import short_repr
 from instrument.sky.base import Sky
 from instrument.units import Complex, Int
 from instrument.visibilities import BeamState, Visibilities
@@ -38,6 +39,7 @@ class Work(NamedTuple):
 class Problem:
     """What an engine is given: where and when (`at`, with the directions of the sky), the chain, the sky, baselines."""
 
+    __repr__ = short_repr
     at: Sampling
     chain: Chain
     sky: Sky

@@ -26,7 +26,15 @@ COUNTS = {"seed", "samples", "count", "bins", "bins_par", "workers", "components
 COUNTS |= {"pixels", "rms", "tolerance", "channel", "indent"}
 # errors, enumerations, and what only a subclass can be; a Direction is a plain tuple, checked wherever it is taken
 NOT_WALKED = {"Component", "InputError", "InstrumentError", "InstrumentWarning", "Outcome", "Simplified", "__version__"}
-NOT_WALKED |= {"Direction", "ScalarTerm", "Predictor", "Stage", "StageRun", "StageResult"}  # those of others are
+NOT_WALKED |= {
+    "Direction",
+    "ScalarTerm",
+    "Predictor",
+    "Stage",
+    "StageRun",
+    "StageResult",
+    "VisibilitySet",
+}  # those of others are
 # (what, argument, poison): why it is accepted
 MEANT: dict[tuple[str, str, str], str] = {
     ("Analyzer.rm_synthesis", "divide_by_i", "True"): "by the way that suits the signal",
@@ -146,6 +154,11 @@ def calls():
         ("Visibilities.with_noise", w.vis.with_noise, {"sefd": 100 * u.Jy, "seed": 1}),
         ("Visibilities.corrected", w.vis.corrected, {"term": w.solution.term}),
         ("Visibilities.corrupted", w.vis.corrupted, {"term": w.solution.term}),
+        ("Visibilities.block", w.vis.block, {"times": slice(0, 1), "channels": slice(0, 1)}),
+        ("Visibilities.save", w.vis.save, {"path": "none/v.h5", "overwrite": True}),
+        ("Visibilities.open", ins.Visibilities.open, {
+            "path": "none.h5", "times": slice(0, 1), "channels": slice(0, 1)}),
+        ("VisibilityFile", ins.VisibilityFile, {"path": "none.h5"}),
         ("Visibilities.without_beam", w.vis.without_beam, {"instrument": w.instrument}),
         ("JonesTable.jones", w.solution.term.jones, {"at": w.at}),
         ("SelfCal.solve", ins.SelfCal().solve, {"data": w.vis, "model": w.vis}),

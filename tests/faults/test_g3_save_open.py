@@ -202,7 +202,7 @@ def test_other_files_are_named(vis, tmp_path):
         ("s.h5", "is no file of visibilities .* an h5parm, which read_h5parm reads"),
         ("t.h5", "is not a readable file of visibilities"),
         ("cut.h5", "is not a readable file of visibilities"),
-        ("x.ms", "is a folder"),
+        ("x.ms", "is a Measurement Set"),
         ("none.h5", "does not exist"),
     ):
         with pytest.raises(FileError, match=text) as found:

@@ -137,7 +137,6 @@ def test_i9_g9_what_cannot_be_is_refused_by_the_plan(settings, words, planned):
         ),
         (["analyze={products=['spectrum-2d'],every=3,uv_range=[1,2]}"], "[analyze]: not used: uv_range, every (they"),
         (["image.robust=1"], "[image]: not used: robust (it is of weighting = 'briggs'"),
-        (["observation.channel_width='1 MHz'"], "[observation]: not used: channel_width"),
     ],
 )
 def test_what_was_not_used_is_named(settings, line, planned):

@@ -87,7 +87,7 @@ def test_many_directions_leaves_the_noise_and_one_direction_more(tmp_path, capsy
 def test_faraday_leakage_goes_all_the_way_to_the_window(tmp_path):
     """A sky without I: what is seen in I has leaked, 0.28 % of P within a factor 2 (the paper: 0.2 to 0.3 %)."""
     status, folder, record = ran(
-        tmp_path, "faraday-leakage", "observation.interval='2 h'", "observation.frequency.width='1 MHz'",
+        tmp_path, "faraday-leakage", "observation.interval='2 h'", "observation.frequency.channel_width='1 MHz'",
         "observation.frequency.channels=32", "image.pixels=80", "image.pixel='3 arcmin'", "image.uv_range=[30,300]",
         "analyze.cube.uv_range=[30,300]", "sky.count=60", "analyze.cube.depths=[-10,10,0.5]",
     )  # fmt: skip

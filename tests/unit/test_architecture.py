@@ -23,6 +23,7 @@ HEAVY = {"astropy", "scipy", "numba", "matplotlib", "ducc0", "h5py", "jinja2", "
 LAYERS = (
     ("errors", "data", "scenes"),
     ("numbers", "compiled", "terminal", "provenance"),
+    ("shown",),
     ("whole_file",),
     ("units", "checked"),
     ("files_in", "memory"),

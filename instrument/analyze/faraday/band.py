@@ -14,6 +14,7 @@ from instrument.errors import InputError
 from instrument.numbers import unmasked
 from instrument.observe.directions import LIGHT
 from instrument.phasor import cis
+from instrument.shown import short_repr
 from instrument.units import Float, to_si
 
 MOST = 2001  # depths of an axis that nobody asked for
@@ -95,6 +96,7 @@ class FaradayBand:
     `channel_m2` is the width in lambda² of the widest channel, NaN where it is not known (one channel).
     """
 
+    __repr__ = short_repr
     lambda2: Float
     weights: Float
     channel_m2: PerhapsNaN

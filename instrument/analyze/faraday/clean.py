@@ -17,6 +17,7 @@ from instrument.analyze.faraday.cube import FaradayCube
 from instrument.compiled import compiled
 from instrument.errors import InputError, InstrumentError, Outcome
 from instrument.phasor import FAST
+from instrument.shown import short_repr
 from instrument.units import Complex, Float, Int
 
 OUTCOMES = (Outcome.CONVERGED, Outcome.ITERATION_LIMIT, Outcome.NON_FINITE)
@@ -37,6 +38,7 @@ class FaradayClean:
     both.
     """
 
+    __repr__ = short_repr
     dirty: FaradayCube
     components: Complex
     residual: Complex

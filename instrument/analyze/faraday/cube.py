@@ -13,6 +13,7 @@ import numpy as np
 from instrument.analyze.faraday.band import FaradayBand, PerhapsNaN, number
 from instrument.checked import checked
 from instrument.observe.directions import LIGHT
+from instrument.shown import short_repr
 from instrument.units import Complex, Direction, Float
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ class FaradayCube:
     set where a voxel is missing, None where none is.
     """
 
+    __repr__ = short_repr
     data: Complex
     depths: Float
     freq_hz: Float

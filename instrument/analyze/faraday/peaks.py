@@ -15,6 +15,7 @@ from instrument.analyze.faraday.cube import FaradayCube
 from instrument.analyze.faraday.kernels import brightest, summit
 from instrument.errors import InputError
 from instrument.provenance import fits_cards
+from instrument.shown import short_repr
 from instrument.units import Bool, Float, Int
 from instrument.whole_file import whole_file
 
@@ -41,6 +42,7 @@ class FaradayPeaks:
     main one.
     """
 
+    __repr__ = short_repr
     depth: Float
     depth_error: Float
     peak: Float

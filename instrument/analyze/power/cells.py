@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +19,7 @@ from instrument.analyze.power.fourier import (
     uv_limits,
 )
 from instrument.analyze.power.modes import Modes
-from instrument.errors import InputError, InstrumentWarning
+from instrument.errors import InputError, warn
 from instrument.image.cube import StokesCube
 from instrument.numbers import LARGEST, squarable
 from instrument.units import Bool, Complex, Float, Int, one_si
@@ -137,7 +136,7 @@ def cells_of(
         raise InputError(f"{stokes} has no data: every pixel is NaN in some channel, or where the taper is not 0")
     if not has.all():
         text = f"{1 - has.mean():.2g} of the lines of sight hold NaN and count as zero: rims of holes scatter power"
-        warnings.warn(text, InstrumentWarning, stacklevel=4)
+        warn(text)
     v, u = np.fft.fftfreq(ny, cube.pixel_rad), np.fft.fftfreq(nx, cube.pixel_rad)
     half = stokes != "P"  # of a real image half the plane is made
     low, high = uv_limits(uv_range)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 
-from instrument.errors import InputError, InstrumentWarning
+from instrument.errors import InputError, warn
 from instrument.image.cube import StokesCube
 from instrument.units import Bool, Float, Int
 
@@ -63,5 +61,5 @@ def infill_operator(freq_hz: Float, here: Bool, delay_s: float) -> Float:
     worst = float(np.sqrt((found**2).sum(axis=1)).max())
     if worst > 2:
         text = f"filling in makes noise {worst:.2g} times as large in some channel: take a smaller delay, or a part"
-        warnings.warn(f"{text} of the band without wide gaps", InstrumentWarning, stacklevel=5)
+        warn(f"{text} of the band without wide gaps")
     return found

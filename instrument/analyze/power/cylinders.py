@@ -14,6 +14,7 @@ from instrument.analyze.power.cells import Cells, Frame
 from instrument.analyze.power.fourier import bin_edges, per_mpc, sine
 from instrument.checked import checked
 from instrument.errors import InputError
+from instrument.shown import short_repr
 from instrument.units import FINITE, Float, Int
 from instrument.whole_file import write_ecsv
 
@@ -24,6 +25,7 @@ class _Spectrum(ABC):
     frame: Frame
     power: Float
     sigma: Float
+    __repr__ = short_repr
 
     @property
     def unit(self) -> str:
@@ -56,7 +58,7 @@ class _Spectrum(ABC):
 
 
 @checked
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Cylindrical(_Spectrum):
     """Power spectrum of a cube in bins of k_perp (P,) and |k_par| (L,): P = V / N² mean |DFT|², `unit`² Mpc³ (P, L).
 
@@ -132,7 +134,7 @@ class Cylindrical(_Spectrum):
 
 
 @checked
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Spherical(_Spectrum):
     """Power spectrum of a cube in bins of k (N,), `unit`² Mpc³; fields as those of `Cylindrical`."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
@@ -11,8 +10,9 @@ import numpy as np
 
 from instrument.analyze.power.fourier import comoving, line_of_sight, per_mpc
 from instrument.checked import checked
-from instrument.errors import InputError, InstrumentWarning, did_you_mean
+from instrument.errors import InputError, did_you_mean, warn
 from instrument.image.cube import StokesCube
+from instrument.shown import short_repr
 from instrument.units import Count, Float, Int, Seed, to_si
 
 TABLE = "eor_21cm_z9.ecsv"
@@ -29,6 +29,7 @@ class Signal21cm:
     ln k; outside it there is no answer.
     """
 
+    __repr__ = short_repr
     name: str
     redshift: float
     k: Float
@@ -140,7 +141,7 @@ class Signal21cm:
             plane *= np.sqrt(np.nan_to_num(power) / cell_mpc.prod())
         if outside > 1:  # k = 0 never has any
             text = f"{outside / cells.size:.2g} of the cells are outside the {self.k[0]:.3g} to {self.k[-1]:.3g} /Mpc"
-            warnings.warn(f"{text} of '{self.name}' and get no power", InstrumentWarning, stacklevel=3)
+            warn(f"{text} of '{self.name}' and get no power")
         return np.asarray(fft.c2r(cells, axes=(0, 1, 2), lastsize=int(size[2]), inorm=2, forward=False, nthreads=0))
 
 

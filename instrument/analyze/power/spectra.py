@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -24,9 +23,10 @@ from instrument.analyze.power.fourier import (
 )
 from instrument.analyze.power.modes import independent, some
 from instrument.checked import checked
-from instrument.errors import InputError, InstrumentWarning
+from instrument.errors import InputError, warn
 from instrument.image.cube import StokesCube
 from instrument.numbers import squarable
+from instrument.shown import short_repr
 from instrument.units import Bool, Float, Int
 from instrument.whole_file import write_ecsv
 
@@ -42,6 +42,7 @@ class Spectrum2D:
     image (count/2 modes of a real field, count of Q + iU, fewer behind a taper or a hole). The PSF is in the power.
     """
 
+    __repr__ = short_repr
     k_perp: Float
     uv: Float
     power: Float
@@ -112,7 +113,7 @@ def spectrum_2d(
         raise InputError(f"{stokes} of channel {channel} has no data: all NaN, or NaN where the taper is not 0")
     if not has.all():
         text = f"{1 - has.mean():.2g} of the pixels are NaN and count as zero: rims of holes scatter steep spectra"
-        warnings.warn(text, InstrumentWarning, stacklevel=3)
+        warn(text)
     squarable(float(np.abs(image[has]).max()), stokes)
     # no interferometer sees the mean, and a taper or a hole would spread it over the first cells
     variance, times = cell_variance(np.where(has, image - image[has].mean(), 0.0), window)

@@ -13,6 +13,7 @@ from instrument.analyze.power.fourier import per_mpc
 from instrument.analyze.power.signal import Signal21cm
 from instrument.checked import checked
 from instrument.errors import InputError
+from instrument.shown import short_repr
 from instrument.units import FINITE, Bool, Float, Share
 from instrument.whole_file import write_ecsv
 
@@ -27,6 +28,7 @@ class EoRWindow:
     amplitude: its power falls by (1 - removed)².
     """
 
+    __repr__ = short_repr
     leakage: Cylindrical
     signal: Float
     noise: Float

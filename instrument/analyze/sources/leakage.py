@@ -15,6 +15,7 @@ from instrument.jones.chain import Chain
 from instrument.jones.mueller import TO_LINEAR, TO_STOKES
 from instrument.observe.directions import separation
 from instrument.observe.sampling import Sampling
+from instrument.shown import short_repr
 from instrument.units import Bool, Complex, Direction, Float, Whole, unit_vectors
 from instrument.whole_file import write_ecsv
 
@@ -37,6 +38,7 @@ class Leakage:
     where it was asked for.
     """
 
+    __repr__ = short_repr
     names: tuple[str, ...]
     ra_rad: Float
     dec_rad: Float

@@ -223,7 +223,7 @@ class CubeAnalysis(Component):
             progress(1.0)
         for text in dict.fromkeys(str(w.message) for w in said if issubclass(w.category, InstrumentWarning)):
             result.warned.append(text)
-            warnings.warn(text, InstrumentWarning, stacklevel=2)
+            warn(text)
         return result
 
     def _unused(self, wanted: list[Product], noise: StokesCube | None) -> None:
