@@ -41,8 +41,7 @@ class _Spectrum(ABC):
         """The same less the power of noise (its bias taken off); errors add in squares. Raises for other bins."""
         demand_same(self, noise)
         sigma = np.hypot(self.sigma, noise.sigma)
-        found: Self = replace(self, power=self.power - noise.power, sigma=sigma)  # type: ignore[type-var]
-        return found
+        return replace(self, power=self.power - noise.power, sigma=sigma)  # type: ignore[type-var]
 
     @abstractmethod
     def edges_of(self) -> tuple[Float, ...]:
