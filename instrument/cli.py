@@ -55,6 +55,11 @@ def parser() -> argparse.ArgumentParser:
     run.add_argument("--no-verify", action="store_true", help="leave out the check against the direct sum")
     scene_verb("plan", "Say what would be done, left out, and at what cost; nothing is computed.")
     _add_analyze(verbs)
+    text = "Say what changed between two run folders: scene, versions, checks, numbers, tables, spectra, costs."
+    both = verbs.add_parser("compare", help=text, description=text)
+    both.add_argument("first", metavar="RUN", help="a run folder")
+    both.add_argument("second", metavar="RUN", help="another, held against the first")
+    _add_out(both, "folder to write a page compare.html into, new or empty (default: none is written)")
     verbs.add_parser("scenes", help="List the shipped scenes.")
     plugins = verbs.add_parser("plugins", help="List the plugins, and what is broken; with a NAME its settings.")
     plugins.add_argument("name", metavar="NAME", nargs="?", help="a plugin: its settings, their units and defaults")
@@ -68,13 +73,9 @@ def _version() -> str:
     return __version__
 
 
-def _add_out(verb: argparse.ArgumentParser) -> None:
-    verb.add_argument(
-        "--out",
-        metavar="DIR",
-        help="folder to write, new or empty (default: runs/NAME, or NAME-2, NAME-3, ... where that is taken); nothing "
-        "that is there is overwritten",
-    )
+def _add_out(verb: argparse.ArgumentParser, text: str = "") -> None:
+    usual = "folder to write, new or empty (default: runs/NAME, or NAME-2, NAME-3, ... where that is taken)"
+    verb.add_argument("--out", metavar="DIR", help=f"{text or usual}; nothing that is there is overwritten")
     verb.add_argument("--force", action="store_true", help="replace an earlier run in that folder")
 
 
@@ -225,6 +226,13 @@ def _plan(given: argparse.Namespace) -> int:
     return DONE
 
 
+def _compare(given: argparse.Namespace) -> int:
+    from instrument.pipeline.compare import compare_runs
+
+    compare_runs(given.first, given.second, given.out, show, given.force)
+    return DONE
+
+
 def _scenes(given: argparse.Namespace) -> int:
     from instrument.pipeline.scene_text import shipped
 
@@ -259,7 +267,15 @@ def _doctor(given: argparse.Namespace) -> int:
     return DONE if doctor(show) else FAILED
 
 
-VERBS = {"run": _run, "plan": _plan, "analyze": _analyze, "scenes": _scenes, "plugins": _plugins, "doctor": _doctor}
+VERBS = {
+    "run": _run,
+    "plan": _plan,
+    "analyze": _analyze,
+    "compare": _compare,
+    "scenes": _scenes,
+    "plugins": _plugins,
+    "doctor": _doctor,
+}
 
 
 if __name__ == "__main__":

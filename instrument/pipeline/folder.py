@@ -13,6 +13,7 @@ from pathlib import Path
 from instrument.errors import InputError, warn
 
 PARTIAL = ".instrument-partial"  # ends the names of folders that are being written
+OURS = ("run.json", "compare.json")  # files that only a folder written here holds
 TAKEN = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)  # what moving a folder onto something else answers
 
 
@@ -21,8 +22,8 @@ class RunFolder:
 
     Inside, `partial` is where to write. Without `finish` nothing is left, not even folders made for it; what runs that
     were killed have left beside it is removed and named. `out=None` takes runs/NAME, or the next free name. Raises
-    `InputError` when the folder is not empty or cannot be made. With `force` a run folder (it holds a run.json) that is
-    there is replaced, once everything is written; no other folder is.
+    `InputError` when the folder is not empty or cannot be made. With `force` a folder that a run wrote is replaced,
+    once everything is written; no other folder is.
     """
 
     def __init__(self, name: str, out: str | None, force: bool = False) -> None:
@@ -81,7 +82,7 @@ class RunFolder:
 
     def _replaces(self, folder: Path) -> bool:
         """Whether an earlier run folder is there that may go."""
-        return self._force and folder.is_dir() and (folder / "run.json").is_file()
+        return self._force and folder.is_dir() and any((folder / name).is_file() for name in OURS)
 
     def _free(self) -> Path:
         """The folder asked for, which must be empty, or the next free one under runs/."""
@@ -93,7 +94,7 @@ class RunFolder:
         if folder.is_symlink():
             raise InputError(f"--out {self._out}: its links lead to one another; choose another")
         if folder.exists() and not self._replaces(folder) and (not folder.is_dir() or any(folder.iterdir())):
-            if not self._force and (folder / "run.json").is_file():
+            if not self._force and any((folder / name).is_file() for name in OURS):
                 raise InputError(f"--out {self._out}: there is a run in it; choose another, or replace it with --force")
             raise InputError(f"--out {self._out}: it exists and is not an empty folder; choose another")
         if folder.is_dir() and os.path.ismount(folder):
