@@ -14,6 +14,7 @@ from instrument.errors import InputError
 from instrument.numbers import COUNT, SEED
 from instrument.observe.directions import LIGHT
 from instrument.predict.base import Problem
+from instrument.sky.points import points_of
 from instrument.units import Complex, Float, Int
 from instrument.visibilities import Visibilities
 
@@ -201,10 +202,10 @@ def watch(checker: Checker, blocks: Iterable[Visibilities]) -> Check:
 
 def cell_seconds(problem: Problem) -> float:
     """What the definition of one time and channel on all baselines costs, on one core."""
-    stations, sources = problem.at.shape[2:]
+    stations, sources = problem.at.shape[2], problem.sky.count
     parts = sum(term.phasors() for term in problem.chain.parts)
-    listed = problem.sky.sources()
-    shaped = sources if listed is None else int(listed.gaussian.sum())
+    listed = points_of(problem.sky)
+    shaped = 0 if problem.sky.kind == "image" else sources if listed is None else int(listed.gaussian.sum())
     matrices = 0.1e-6 + 0.35e-6 * len(problem.chain.terms)
     return (
         2.5e-3
@@ -221,18 +222,9 @@ def definition(problem: Problem) -> Complex:
     Points are summed as one product of stations, (J_a B K_a) (J_b K_b)^H; sources with shapes baseline by baseline.
     Slow twin: `Direct`; tests/accuracy/test_check.py compares them.
     """
-    listed = problem.sky.sources()
-    stations, sources = problem.at.shape[2:]
-    room = max(1, ROOM // stations)
-    if listed is None or sources <= room or problem.at.seen is not None:
-        return _sum(problem)
     out = np.zeros((problem.shape[2], 2, 2), complex)
-    for first in range(0, sources, room):
-        part = listed.select(np.arange(first, min(first + room, sources)))
-        out += _sum(Problem(
-            problem.at.towards(*part.directions()), problem.chain, part, problem.antenna1, problem.antenna2,
-            problem.interval_s, problem.width_hz,
-        ))  # fmt: skip
+    for part in problem.parts(max(1, ROOM // problem.at.shape[2])):
+        out += _sum(part)
     return out
 
 
@@ -245,8 +237,11 @@ def _sum(problem: Problem) -> Complex:
     jones = problem.chain.jones(at)
     right = np.broadcast_to(jones[0, 0], (stations, sources, 2, 2)) * fringe
     left = mat2.mul(right, np.broadcast_to(sky.brightness(at)[0, 0], (sources, 2, 2)))
-    listed = sky.sources()
-    shaped = np.arange(sources) if listed is None else np.flatnonzero(listed.gaussian)
+    listed = points_of(sky)
+    if listed is not None:
+        shaped = np.flatnonzero(listed.gaussian)
+    else:
+        shaped = np.arange(0 if sky.envelope(at, np.zeros((1, 1, 1, 3))) is None else sources)
     points = np.delete(np.arange(sources), shaped)
     a, b = problem.antenna1, problem.antenna2
     rows, columns = (

@@ -8,7 +8,7 @@ from instrument import mat2
 from instrument.observe.directions import EARTH_RATE, LIGHT, separation, tangents
 from instrument.plan import Item, count_of
 from instrument.predict.base import Problem
-from instrument.sky.points import FWHM_TO_SIGMA
+from instrument.sky.points import FWHM_TO_SIGMA, points_of
 from instrument.sky.rounding import flux
 from instrument.units import Float, Int, si_prefix
 
@@ -25,7 +25,7 @@ def not_modelled(problem: Problem, scale_jy: float) -> list[Item]:
 
 def _doubts(problem: Problem) -> list[Item]:
     """What spectra make of the sources at these frequencies, and what of their file was not read."""
-    sky = problem.sky.sources()
+    sky = points_of(problem.sky)
     return [] if sky is None else [Item(name, text) for name, text in sky.doubts(problem.at.freq_hz).items()]
 
 
@@ -65,7 +65,7 @@ def _extended(problem: Problem, scale_jy: float) -> list[Item]:
 
     |V - V'| <= integral G |J B J^H - J0 B J0^H| on every baseline, for the phases have modulus 1.
     """
-    sky = problem.sky.sources()
+    sky = points_of(problem.sky)
     if sky is None or not sky.gaussian.any() or not any(t.directional for t in problem.chain.parts):
         return []
     jansky = flux(sky, problem.at).max(axis=(0, 1))
@@ -85,7 +85,7 @@ def _extended(problem: Problem, scale_jy: float) -> list[Item]:
 
 def _change(problem: Problem, rows: Int) -> Float:
     """What the beam changes by across sources of 1 Jy, weighted with their shapes: the largest at some times."""
-    sky = problem.sky.sources()
+    sky = points_of(problem.sky)
     assert sky is not None
     part = sky.select(rows)
     angle = np.zeros(len(part)) if part.angle_rad is None else part.angle_rad

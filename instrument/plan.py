@@ -92,11 +92,11 @@ class Plan(VisibilitySet):
 
     def __str__(self) -> str:
         times, channels, baselines = self.full.shape
-        stations, sources = self.full.at.shape[2:]
+        stations = self.full.at.shape[2]
         head = (
             f"scene {self.name}: {count_of(stations, 'station')}, {count_of(baselines, 'baseline')}, "
             f"{count_of(times, 'time')}, {count_of(channels, 'channel')} ({band_of(self.full)}), "
-            f"{count_of(sources, 'direction')}, tolerance {self.tolerance:g}"
+            f"{self.full.sky.size}, tolerance {self.tolerance:g}"
         )
         lines = [head]
         lines += [f"kept          {i.name:<22} {i.reason}" for i in self.kept]

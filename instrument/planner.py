@@ -22,8 +22,9 @@ from instrument.plan import Item, Plan, count_of
 from instrument.predict.base import Predictor, Prepared, Problem, Work
 from instrument.predict.rounding import known_gain, rounding, total_flux, unknown_peaks
 from instrument.registry import available, load
-from instrument.sky.base import Sky
-from instrument.sky.rounding import polarized
+from instrument.sky.base import Sky, power
+from instrument.sky.image import ImageSky
+from instrument.sky.points import PointSky, points_of
 from instrument.units import Bool, Float, si_prefix, to_si
 
 BLOCK_BYTES = 64e6
@@ -53,7 +54,7 @@ def make_plan(
         )
     sky = sky.about(observation.phase_centre)
     warn_outside_band(chain, observation.freq_hz)
-    ra, dec = sky.directions()
+    ra, dec = sky.outline()
     channels = observation.freq_hz.size
     afford(
         300.0 * channels * len(ra), f"a sky of {len(ra)} directions in {channels} channels", "ask for fewer of either"
@@ -179,9 +180,23 @@ def _simplify_chain(chain: Chain, at: Sampling, budget: Budget, kept: list[Item]
 
 def _simplify_sky(full: Problem, chain: Chain, budget: Budget, left_out: list[Item]) -> Problem:
     """Drop directions that give exactly nothing, and with a tolerance the faintest, by flux times the peak of |J|^2."""
-    sky = full.sky.sources()
-    if sky is None:
-        return replace(full, chain=chain)
+    problem, sky = replace(full, chain=chain), points_of(full.sky)
+    if sky is not None:
+        return _fewer(problem, sky, budget, left_out)
+    there = full.sky.nonzero(full.at.freq_hz)
+    if not any(there):
+        raise InputError(f"the sky ({full.sky.size}) has no flux at all")
+    if isinstance(full.sky, ImageSky) and (dark := len(full.sky.grid) - full.sky.count):
+        left_out.append(Item(count_of(dark, "pixel"), "no flux"))
+    if not all(there):
+        zero = ", ".join(kind for kind, has in zip(KINDS, there, strict=True) if not has)
+        left_out.append(Item(f"{zero} of the sky", "zero in every direction"))
+    return problem
+
+
+def _fewer(full: Problem, sky: PointSky, budget: Budget, left_out: list[Item]) -> Problem:
+    """A list without the sources that are below the horizon or have no flux, nor, with a tolerance, the faintest."""
+    chain = full.chain
     stokes = sky.stokes(full.at.freq_hz)
     use = np.any(stokes != 0, axis=(0, 2))
     if not use.all():
@@ -211,7 +226,7 @@ def _simplify_sky(full: Problem, chain: Chain, budget: Budget, left_out: list[It
 
 def _faint(stokes: Float, use: Bool, peak: float, tolerance: float) -> tuple[Bool, float]:
     """The faintest sources whose sum stays below a tolerance, and that sum."""
-    flux = np.abs(stokes[..., 0]) + polarized(stokes)
+    flux = power(stokes)
     share = peak * (peak * flux / flux.sum(axis=1).max()).max(axis=0)
     faint = np.zeros(len(use), bool)
     if not np.isfinite(peak):

@@ -275,7 +275,7 @@ def envelope(sky, at, waves):
 
 def visibilities(problem):
     """Visibilities in Jy, clongdouble (T, F, B, 2, 2), of a problem whose sky is a list."""
-    at, sky = problem.at, problem.sky.sources()
+    at, sky = problem.at, problem.sky
     g = geometry(at)
     jones = matrix(1, 0, 0, 1)
     for term in problem.chain.terms:

@@ -21,6 +21,7 @@ from instrument.errors import InputError
 from instrument.image.common_beam import say_unequal_beams
 from instrument.image.cube import StokesCube
 from instrument.sky.base import Sky
+from instrument.sky.points import points_of
 from instrument.units import Direction, Index
 from instrument.visibilities import Visibilities, VisibilitySet
 
@@ -55,7 +56,7 @@ class Analyzer:
         if fluxes is None:
             if self.visibilities is None or self.sky is None:
                 raise InputError("leakage needs visibilities and the sky: Analyzer(cube, visibilities=vis, sky=sky)")
-            sky = self.sky.about(centre).sources()
+            sky = points_of(self.sky.about(centre))
             if sky is None:
                 raise InputError(
                     f"leakage of sources needs a sky that is a list of them, got {type(self.sky).__name__}"

@@ -17,10 +17,12 @@ from instrument.jones.gain import GainTerm
 from instrument.jones.parallactic import Parallactic
 from instrument.jones.station import Level, StationBeam
 from instrument.observe.directions import EarthFrame, offset
+from instrument.observe.grid import ImageGrid
 from instrument.observe.layout import Layout, geodetic_axes
 from instrument.observe.sampling import Sampling
 from instrument.predict.base import Problem
-from instrument.sky.base import Sky
+from instrument.sky.base import PlacedSky
+from instrument.sky.image import ImageSky
 from instrument.sky.points import PointSky
 from instrument.units import Complex, Direction, Float
 
@@ -197,7 +199,7 @@ class _Dipole(ElementBeam):
         return (up * mat2.pack(tilt * cos, -sin, tilt * sin, cos))[:, None]
 
 
-class _NotAList(Sky):
+class _NotAList(PlacedSky):
     """A sky that does not say that it is a list of sources."""
 
     inner: PointSky
@@ -213,6 +215,10 @@ class _NotAList(Sky):
     def envelope(self, at: Sampling, uvw_lambda: Float) -> Float | None:
         """Of the sources."""
         return self.inner.envelope(at, uvw_lambda)
+
+    def total_jy(self, freq_hz: Float) -> Float:
+        """Of the sources."""
+        return self.inner.total_jy(freq_hz)
 
 
 def random_sky(centre: Direction, polarized: bool, gaussian: bool, seed: int = 0, count: int = 9) -> PointSky:
@@ -252,9 +258,36 @@ def problems() -> dict[str, Problem]:
         "polarized points, every station its own axes": _problem(own, Chain(station, Parallactic()), points),
         "points and Gaussians, phased stations": _problem(at, Chain(*receivers, station, Parallactic()), shaped),
         "a sky that is not a list": _problem(at, Chain(_Dipole(), Parallactic()), _NotAList(inner=points)),
+        "an image, no Jones term": _problem(at, Chain(), random_image(at)),
+        "an image, phased stations": _problem(at, Chain(*receivers, station, Parallactic()), random_image(at)),
     }
 
 
-def _problem(at: Sampling, chain: Chain, sky: Sky) -> Problem:
+def longer(problem: Problem, times: int, channels: int) -> Problem:
+    """A problem with so many times, every minute, and channels, within its own; itself where it has as many."""
+    from astropy import units as u
+    from astropy.time import Time
+
+    at, sky = problem.at, problem.sky
+    if times <= at.shape[0] and channels <= at.shape[1]:
+        return problem
+    freq_hz = np.linspace(at.freq_hz.min(), at.freq_hz.max(), max(channels, at.shape[1]))
+    when = Time(START, scale="utc") + np.arange(max(times, at.shape[0])) * u.min
+    if isinstance(sky, ImageSky):
+        planes = np.resize(sky.stokes, (len(freq_hz), *sky.stokes.shape[1:]))
+        sky = sky.with_fields(stokes=planes, frequencies=freq_hz * u.Hz)
+    more = Sampling.build(at.layout, when, freq_hz, at.ra_rad, at.dec_rad, at.centre)
+    return replace(problem, at=more, sky=sky)
+
+
+def random_image(at: Sampling) -> ImageSky:
+    """6 x 4 pixels of 1 deg in the channels of a sampling, in all Stokes parameters, some of them zero; P > I."""
+    stokes = np.random.default_rng(3).uniform(-1, 1, (len(at.freq_hz), 4, 6, 4))
+    stokes[..., 1, 2] = 0.0
+    grid = ImageGrid.of((6, 4), np.deg2rad(1.0), at.centre)
+    return ImageSky(grid=grid, stokes=stokes, frequencies=[f"{f!r} Hz" for f in at.freq_hz.tolist()])
+
+
+def _problem(at: Sampling, chain: Chain, sky: PlacedSky) -> Problem:
     a, b = at.layout.baselines
-    return Problem(at.towards(*sky.directions()), chain, sky, a, b, interval_s=10.0, width_hz=1e5)
+    return Problem(at.towards(*sky.outline()), chain, sky, a, b, interval_s=10.0, width_hz=1e5)

@@ -141,8 +141,12 @@ def _engine(engine: Predictor, at: Sampling | None) -> Iterator[Line]:
     served = {name: problem for name, problem in some.items() if engine.refuses(problem) is None}
     for name, problem in served.items():
         yield _line(engines.it_agrees_with_direct, engine, problem, after=f": {name}")
-    for claim in engines.CLAIMS:
-        yield _line(claim, engine, list(served.values())[-1])
+        if problem.sky.kind == "image":
+            yield _line(engines.its_adjoint_is_that_of_its_sums, engine, problem, after=f": {name}")
+    last = {problem.sky.kind == "image": problem for problem in served.values()}
+    for image, problem in last.items():
+        for claim in engines.CLAIMS:
+            yield _line(claim, engine, problem, after=": an image" if image and len(last) > 1 else "")
 
 
 def _calibrator(calibrator: Calibrator, at: Sampling | None) -> Iterator[Line]:

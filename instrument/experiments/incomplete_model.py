@@ -32,7 +32,7 @@ from instrument.observe.sampling import Sampling
 from instrument.plan import Plan
 from instrument.planner import BLOCK_BYTES
 from instrument.predict.base import Problem
-from instrument.sky.points import PointSky
+from instrument.sky.points import PointSky, points_of
 from instrument.units import Complex, Int, Jansky, Seed
 from instrument.visibilities import Visibilities
 
@@ -72,7 +72,7 @@ class IncompleteModel(Component):
         `progress` is called with the fraction done. Raises `InputError` where the sky is no list of sources, or has
         fewer than a model asks for.
         """
-        sky = plan.problem.sky.sources()
+        sky = points_of(plan.problem.sky)
         if sky is None:
             raise InputError(
                 f"a model of the n brightest needs a list of sources, not {type(plan.problem.sky).__name__}"

@@ -200,8 +200,7 @@ def find_ghosts(cube: StokesCube, sky: PointSky) -> Ghost:
     image = cube.data[0, 0]
     if cube.centre is None or cube.psf is None:
         raise InputError("ghosts are looked for in images with a phase centre and a PSF")
-    m, l = ((np.arange(n) - n // 2) * cube.pixel_rad for n in image.shape)
-    where = np.stack(np.broadcast_arrays(-l[None], m[:, None]), axis=-1)
+    where = cube.grid.lmn[:, :2].reshape(*image.shape, 2)
     free = KDTree(lmn(sky.vectors, cube.centre)[:, :2]).query(where)[0] > float(cube.psf.major_rad[0])
     free &= np.isfinite(image)
     away = np.where(free, np.abs(image), -1.0)

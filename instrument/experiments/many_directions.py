@@ -25,7 +25,7 @@ from instrument.jones.table import JonesTable
 from instrument.observe.sampling import Sampling
 from instrument.plan import Plan
 from instrument.planner import BLOCK_BYTES
-from instrument.sky.points import PointSky
+from instrument.sky.points import PointSky, points_of
 from instrument.units import Bool, Complex, Int, Jansky, Seconds, to_si
 from instrument.visibilities import Visibilities
 
@@ -54,7 +54,7 @@ class ManyDirections(Component):
         `progress` is called with the fraction done. Raises `InputError` where the sky is no list of sources, or has
         fewer than `clusters`.
         """
-        sky = plan.problem.sky.sources()
+        sky = points_of(plan.problem.sky)
         if sky is None:
             raise InputError(f"clusters need a list of sources, not {type(plan.problem.sky).__name__}")
         job = _Job(self, plan, sky, cluster_of(sky, self.clusters))

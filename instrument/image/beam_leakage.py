@@ -42,9 +42,7 @@ def leaked_through(
     from astropy import units as u
     from astropy.coordinates import SkyCoord
 
-    centre, (ny, nx) = cube.centre, cube.data.shape[2:]
-    # x runs to the west
-    l, m = -(np.arange(nx) - nx // 2) * cube.pixel_rad, (np.arange(ny) - ny // 2) * cube.pixel_rad
+    centre, l, m = cube.centre, cube.grid.east, cube.grid.north
     l_at, m_at, f_at = _points(l, nodes), _points(m, nodes), _points(cube.freq_hz, channels)
 
     def entries(east: Float, north: Float, freq_hz: Float) -> Float:

@@ -15,7 +15,9 @@ from instrument.image.channels import channel_index, in_band
 from instrument.image.common_beam import at_common_beam
 from instrument.image.cube_file import write_cube
 from instrument.observe.directions import LIGHT
+from instrument.observe.grid import ImageGrid
 from instrument.shown import short_repr
+from instrument.sky.image import ImageSky
 from instrument.units import Count, Direction, Float, one_si, to_si
 
 BOLTZMANN = 1.380649e-23  # J/K
@@ -127,6 +129,11 @@ class StokesCube:
         put(self, "psf", psf and psf.of(len(cube)))
 
     @property
+    def grid(self) -> ImageGrid:
+        """The pixels on the sky."""
+        return ImageGrid.of(self.data.shape, self.pixel_rad, self.centre)
+
+    @property
     def wcs(self) -> Any:
         """World coordinates of the axes (x, y, Stokes, frequency), SIN projection about the centre.
 
@@ -136,18 +143,24 @@ class StokesCube:
         from astropy.wcs import WCS
 
         out = WCS(naxis=4)
-        ny, nx = self.data.shape[2:]
-        out.wcs.ctype = ["RA---SIN", "DEC--SIN", "STOKES", "FREQ"]
-        out.wcs.cunit = ["deg", "deg", "", "Hz"]
-        step = np.rad2deg(self.pixel_rad)
         # 1 Hz where there is no spacing: an axis of step 0 has no coordinates
         spacing = (float(np.diff(self.freq_hz).mean()) if len(self.freq_hz) > 1 else 0.0) or 1.0
-        out.wcs.cdelt = [-step, step, 1.0, spacing]
-        out.wcs.crpix = [nx // 2 + 1, ny // 2 + 1, 1, 1]
-        centre = self.centre or Direction(0.0, 0.0)
-        out.wcs.crval = [np.rad2deg(centre.ra_rad), np.rad2deg(centre.dec_rad), 1.0, float(self.freq_hz[0])]
-        out.wcs.radesys = "ICRS"
+        axes = (*self.grid.fits_axes, ("STOKES", 1.0, 1.0, 1.0), ("FREQ", float(self.freq_hz[0]), spacing, 1.0))
+        out.wcs.ctype, out.wcs.crval, out.wcs.cdelt, out.wcs.crpix = zip(*axes, strict=True)
+        out.wcs.cunit, out.wcs.radesys = ["deg", "deg", "", "Hz"], "ICRS"
         return out
+
+    def sky(self) -> ImageSky:
+        """The cube as a sky for scenes: every pixel a point of its Jy; from Jy/pixel, or K by its solid angle."""
+        from astropy import units as u
+
+        if self.unit == "Jy/beam":
+            raise InputError("a cube in Jy/beam is no sky: its pixels are blurred; give one in Jy/pixel or K")
+        jansky = np.asarray(self.data, float)
+        if self.unit == "K":
+            per_k = 2 * BOLTZMANN * self.freq_hz**2 / LIGHT**2 * self.pixel_rad**2 / JY
+            jansky = jansky * per_k[:, None, None, None]
+        return ImageSky(grid=self.grid, stokes=jansky, frequencies=self.freq_hz * u.Hz)
 
     def to_kelvin(self) -> StokesCube:
         """The same in K, Rayleigh-Jeans: c² / (2 k nu² Omega), the solid angle of each channel's PSF, or of a pixel.

@@ -15,7 +15,8 @@ from instrument.image.cube import Psf, StokesCube
 from instrument.image.psf import fit_psf
 from instrument.image.weights import Density, Weighting
 from instrument.observe.directions import LIGHT
-from instrument.units import Complex, Float, Radians
+from instrument.observe.grid import ImageGrid
+from instrument.units import Complex, Direction, Float, Radians
 from instrument.visibilities import Visibilities, VisibilitySet
 from instrument.visibility_sets import as_set
 
@@ -46,13 +47,12 @@ class Imager(Component):
 
     @model_validator(mode="after")
     def _on_the_sky(self) -> Self:
-        half = self.pixels / 2 * self.pixel
-        if 2 * half**2 > 1:
-            side = np.rad2deg(2 * half)
-            raise InputError(
-                f"{self.pixels} pixels of {np.rad2deg(self.pixel):.3g} deg are {side:.3g} deg: beyond the sky"
-            )
+        self.grid().on_the_sky()
         return self
+
+    def grid(self, centre: Direction | None = None) -> ImageGrid:
+        """The pixels of its images, about a phase centre."""
+        return ImageGrid.of((self.pixels, self.pixels), self.pixel, centre)
 
     @field_validator("uv_range")
     @classmethod

@@ -145,10 +145,10 @@ def leaked(
     if not (np.isfinite(fraction) and r_0 > 0 and nu_0 > 0):
         given = f"fraction = {fraction}, radius = {radius}, frequency = {frequency}"
         raise InputError(f"{given}: the first must be finite, the others above 0")
-    north, east = ((np.arange(n) - n // 2) * cube.pixel_rad for n in (ny, nx))
-    # x runs to the west; r² cos 2 chi = north² - east², r² sin 2 chi = 2 north east
+    north, east = cube.grid.north, cube.grid.east
+    # r² cos 2 chi = north² - east², r² sin 2 chi = 2 north east
     cosine = ((north[:, None] ** 2 - east**2) / r_0**2).astype(np.float32)
-    sine = (-2 * north[:, None] * east / r_0**2).astype(np.float32)
+    sine = (2 * north[:, None] * east / r_0**2).astype(np.float32)
     data = np.array(cube.data, np.result_type(cube.data, np.float32))
     for plane, hertz in zip(data, cube.freq_hz, strict=True):
         scale = np.float32(fraction * (hertz / nu_0) ** 2)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar, NamedTuple
@@ -15,11 +15,12 @@ from instrument.component import Component
 from instrument.jones.chain import Chain
 from instrument.observe.sampling import Sampling
 from instrument.shown import short_repr
-from instrument.sky.base import Sky
+from instrument.sky.base import PlacedSky
 from instrument.units import Complex, Int
 from instrument.visibilities import BeamState, Visibilities
 
 EVERY = slice(None)
+CHUNK = 4096  # directions summed at once, where a sky has more
 
 
 class Work(NamedTuple):
@@ -37,12 +38,15 @@ class Work(NamedTuple):
 
 @dataclass(frozen=True)
 class Problem:
-    """What an engine is given: where and when (`at`, with the directions of the sky), the chain, the sky, baselines."""
+    """What an engine is given: where and when (`at`), the chain, the sky, baselines.
+
+    `at` is towards the outline of the sky: all its directions, or a coarse grid of those of an image.
+    """
 
     __repr__ = short_repr
     at: Sampling
     chain: Chain
-    sky: Sky
+    sky: PlacedSky
     antenna1: Int
     antenna2: Int
     interval_s: float
@@ -55,6 +59,14 @@ class Problem:
     def between(self, antenna1: Int, antenna2: Int) -> Problem:
         """The same for some baselines."""
         return replace(self, antenna1=np.asarray(antenna1), antenna2=np.asarray(antenna2))
+
+    def parts(self, most: int = CHUNK) -> Iterator[Problem]:
+        """The same in pieces of at most so many directions each, whose sums add up; each towards all of its own."""
+        if self.sky.kind != "image" and (self.sky.count <= most or self.at.seen is not None):
+            yield self
+            return
+        for sky in self.sky.parts(most, self.at.freq_hz):
+            yield replace(self, sky=sky, at=self.at.towards(*sky.directions()))
 
     def visibilities(self, data: Complex) -> Visibilities:
         """Data (T, F, B, 2, 2) with the coordinates of the problem."""
@@ -103,10 +115,6 @@ class Predictor(Component):
         """Visibilities in Jy, complex (T, F, B, 2, 2), of an engine without state: blocks may be cut anywhere."""
         raise NotImplementedError(f"{type(self).__name__} has neither sums nor a prepare of its own")
 
-    def predict(self, problem: Problem) -> Visibilities:
-        """The same with their coordinates."""
-        return problem.visibilities(self.sums(problem))
-
 
 @dataclass(frozen=True)
 class Prepared(ABC):
@@ -152,4 +160,4 @@ class Blockwise(Prepared):
 
     def task(self, times: slice, channels: slice) -> Callable[[], Visibilities]:
         """The engine and the block alone."""
-        return partial(self.engine.predict, self.block(times, channels))
+        return partial(replace(self, problem=self.block(times, channels)).predict, EVERY, EVERY)

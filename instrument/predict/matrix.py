@@ -18,6 +18,7 @@ from instrument.jones.chain import Factors
 from instrument.observe.directions import LIGHT
 from instrument.phasor import FAST, station_phases
 from instrument.predict.base import Predictor, Problem, Work
+from instrument.sky.points import points_of
 from instrument.units import Complex, Int
 
 FEW = 6  # groups of stations up to which products are made per pair of groups
@@ -28,7 +29,7 @@ class Matrix(Predictor):
 
     def refuses(self, problem: Problem) -> str | None:
         """Refuses skies that are not lists of sources."""
-        return "the sky is not a list of sources" if problem.sky.sources() is None else None
+        return None if problem.sky.kind == "points" else "the sky is not a list of sources"
 
     def work(self, problem: Problem) -> Work:
         """8 operations for each pair of stations, source and product (1 to 4 of them), and the beams before."""
@@ -62,7 +63,7 @@ class Matrix(Predictor):
             z *= factors.scalar
         sky = np.broadcast_to(problem.sky.brightness(at), (times, channels, sources, 2, 2))
         out = np.zeros((*problem.shape, 2, 2), complex)
-        listed = problem.sky.sources()
+        listed = points_of(problem.sky)
         assert listed is not None  # or it would have been refused
         points, shaped = np.flatnonzero(~listed.gaussian), np.flatnonzero(listed.gaussian)
         if len(points):
@@ -79,8 +80,7 @@ class Matrix(Predictor):
 
 def _products(problem: Problem, shares: int) -> float:
     """How many (A, S) x (S, A) products each time and channel needs."""
-    listed = problem.sky.sources()
-    polarized = listed.flux_kinds(problem.at.freq_hz) if listed else (True,) * 4
+    polarized = problem.sky.nonzero(problem.at.freq_hz)
     structure = problem.chain.structure
     if shares <= FEW:
         if structure == "scalar" and not any(polarized[1:]):

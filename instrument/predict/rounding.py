@@ -14,8 +14,9 @@ from instrument.jones.parallactic import Parallactic
 from instrument.mat2 import UNIT
 from instrument.observe.directions import LIGHT
 from instrument.observe.sampling import Sampling
-from instrument.predict.base import Problem
-from instrument.sky.rounding import FLUX_CELLS, brightness_rounding, flux
+from instrument.predict.base import CHUNK, Problem
+from instrument.sky.points import FLUX_CELLS, points_of
+from instrument.sky.rounding import brightness_rounding, flux
 from instrument.units import Float
 
 SEEN = 16  # roundings of an apparent direction in the axes of a station: angles, M (s + v), unit length, axes
@@ -24,16 +25,13 @@ PRODUCT = 12  # of a product of two 2x2 matrices
 
 def total_flux(problem: Problem) -> float:
     """|I| + P of all sources in the brightest channel and at the brightest time, Jy."""
-    largest = 0.0
-    for part in _cells(problem):
-        largest = float(np.maximum(largest, flux(part.sky, part.at).sum(axis=-1).max()))  # max() would drop NaN
-    return largest
+    return float(problem.sky.total_jy(problem.at.freq_hz).max())
 
 
 def rounding(problem: Problem, scale_jy: float) -> float:
     """Bound on the rounding of any visibility, relative to `scale_jy`."""
     gain = known_gain(problem.chain, problem.at)
-    relative = gain * (_phase(problem) + UNIT * (2 * len(problem.at.ra_rad) + 40)) + _jones(problem)
+    relative = gain * (_phase(problem) + UNIT * (2 * _added(problem) + 40)) + _jones(problem)
     largest = 0.0
     for part in _cells(problem):
         jansky = flux(part.sky, part.at)
@@ -56,7 +54,7 @@ def unknown_peaks(problem: Problem) -> list[str]:
 def _cells(problem: Problem) -> list[Problem]:
     """Pieces of times and channels that hold a brightness of moderate size."""
     times, channels, _, sources = problem.at.shape
-    if problem.sky.sources() is not None:
+    if problem.sky.kind != "other":
         times = 1  # the same at all
     slots = max(1, int(FLUX_CELLS / sources))
     nf = min(channels, slots)
@@ -68,6 +66,12 @@ def _cells(problem: Problem) -> list[Problem]:
     ]
 
 
+def _added(problem: Problem) -> float:
+    """Roundings of a sum of all directions: engines add images in chunks, and then the chunks."""
+    count = problem.sky.count
+    return count if problem.sky.kind != "image" else min(count, CHUNK + count / CHUNK)
+
+
 def _phase(problem: Problem) -> Float:
     """Rounding of the fringe of each source on the longest baselines, and of the shape of a Gaussian, (S,)."""
     at = problem.at
@@ -76,12 +80,12 @@ def _phase(problem: Problem) -> Float:
     baseline = float(np.linalg.norm(offsets[a] - offsets[b], axis=1).max())
     size = np.linalg.norm(offsets, axis=1)
     per_m = float(at.freq_hz.max()) / LIGHT
-    reach = np.linalg.norm(at.lmn, axis=1)
+    reach = np.linalg.norm(at.lmn, axis=1) + problem.sky.reach_rad
     # a baseline sees what its two stations have in common, the axes (16) and l, m (12, of 1 and not of themselves);
     # the products of each station round by its distance from the centre of the array, which may be far outside
     turns = baseline * (16 * reach + 12) + 8 * float((size[a] + size[b]).max()) * reach
     out = 2 * np.pi * per_m * turns + 12
-    listed = problem.sky.sources()
+    listed = points_of(problem.sky)
     if listed is not None and listed.gaussian.any():
         # 4 pi^2 x exp(-2 pi^2 x^2) <= 3.9 for each axis; x is good to 30 roundings of |uv| sigma
         out = out + 3.9 * 30 * per_m * baseline * np.linalg.norm(listed.shape_axes(at.centre), axis=-1).sum(axis=-1)
@@ -90,7 +94,7 @@ def _phase(problem: Problem) -> Float:
 
 def _jones(problem: Problem) -> Float:
     """Rounding of J_a B J_b^H for a source of unit brightness, (S,) or (1,)."""
-    at, parts = problem.at, problem.chain.parts
+    at, parts, near = problem.at, problem.chain.parts, problem.sky.reach_rad
     if not parts:
         return np.zeros(1)
     peaks = [t.peak(at) for t in parts]
@@ -109,8 +113,8 @@ def _jones(problem: Problem) -> Float:
         if turned and elements:
             k, element = elements[0]
             jump = element.jump(at) * float(np.prod(peaks[:k] + peaks[k + 1 :]))
-        wrong = wrong + jump * np.minimum(UNIT * SEEN / np.maximum(at.rising.zenith, UNIT), np.pi)
+        wrong = wrong + jump * np.minimum(UNIT * SEEN / np.maximum(at.rising.zenith - near, UNIT), np.pi)
     if problem.chain.blind_below_horizon:
-        wrong = wrong + np.where(at.rising.horizon < UNIT * SEEN, whole, 0.0)
+        wrong = wrong + np.where(at.rising.horizon - near < UNIT * SEEN, whole, 0.0)
     with np.errstate(over="ignore"):  # then nothing is known
         return np.asarray(2 * whole * wrong + wrong**2)

@@ -13,10 +13,9 @@ from instrument.errors import InputError, warn
 from instrument.memory import afford
 from instrument.numbers import Count, Finite, NotNegative, Seed, Share
 from instrument.observe.directions import offset, tangents
-from instrument.observe.sampling import Sampling
 from instrument.sky.base import Sky
 from instrument.sky.points import PointSky
-from instrument.units import Complex, Direction, Float, Hertz, Jansky, Radians
+from instrument.units import Direction, Float, Hertz, Jansky, Radians
 
 
 class GeneratedSky(Sky):
@@ -35,21 +34,6 @@ class GeneratedSky(Sky):
             self._placed.clear()
             self._placed[centre] = placed
         return self._placed[centre]
-
-    def directions(self) -> tuple[Float, Float]:
-        """Raises `InputError`: not placed."""
-        raise self._unplaced()
-
-    def brightness(self, at: Sampling) -> Complex:
-        """Raises `InputError`: not placed."""
-        raise self._unplaced()
-
-    def envelope(self, at: Sampling, uvw_lambda: Float) -> Float | None:
-        """Raises `InputError`: not placed."""
-        raise self._unplaced()
-
-    def _unplaced(self) -> InputError:
-        return InputError(f"{type(self).__name__} has no sources yet: call about(phase_centre) first")
 
 
 class GridSky(GeneratedSky):

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import model_validator
@@ -16,7 +16,7 @@ from instrument.jones.mueller import brightness
 from instrument.numbers import Whole
 from instrument.observe.directions import LIGHT, separation, tangents
 from instrument.observe.sampling import Sampling
-from instrument.sky.base import Sky
+from instrument.sky.base import PlacedSky, Sky, power
 from instrument.units import ArrayOf, Complex, Direction, Float, Int, unit_vectors
 
 Column = Annotated[Any, ArrayOf(float, (None,))]
@@ -28,12 +28,13 @@ OPTIONAL = (
     "reference_hz", "spectral_terms", "logarithmic", "rotation_measure", "polarization_follows_i", "major_rad",
     "minor_rad", "angle_rad",
 )  # fmt: skip
+FLUX_CELLS = 2e6  # entries (T, F, S) worked out at once
 MOST_RM = 1e15  # rad/m2; 2 RM lambda^2 has lost all its digits long before
 PER_SOURCE = ("ra_rad", "dec_rad", "stokes_jy", *OPTIONAL)
 
 
 @checked
-class PointSky(Sky):
+class PointSky(PlacedSky):
     """S sources: Stokes I, Q, U, V (S, 4) in Jy at `reference_hz`, with spectra, rotation measures and Gaussian shapes.
 
     Stokes I: with logarithmic terms `I0 (f/f0)^(c0 + c1 x + c2 x^2 ...)`, x = log10(f/f0); with linear ones
@@ -45,6 +46,7 @@ class PointSky(Sky):
     source ("" for none).
     """
 
+    kind: ClassVar[Literal["points", "image", "other"]] = "points"
     names: tuple[str, ...]
     patches: tuple[str, ...] = ()
     ra_rad: Column
@@ -172,9 +174,14 @@ class PointSky(Sky):
     def __len__(self) -> int:
         return len(self.names)
 
-    def sources(self) -> PointSky:
+    def about(self, centre: Direction) -> PointSky:
         """Itself."""
         return self
+
+    def parts(self, most: int, freq_hz: Float) -> Iterator[PointSky]:
+        """The sources in pieces of at most so many, in their order."""
+        for first in range(0, len(self), most):
+            yield self if most >= len(self) else self.select(np.arange(first, min(first + most, len(self))))
 
     def select(self, rows: Int | Sequence[int]) -> PointSky:
         """The sources of some rows, in that order."""
@@ -299,7 +306,19 @@ class PointSky(Sky):
         out[:, 1] = FWHM_TO_SIGMA * np.asarray(self.minor_rad)[:, None] * (minor @ axes.T)
         return out
 
-    def flux_kinds(self, freq_hz: Float) -> tuple[bool, bool, bool, bool]:
+    def total_jy(self, freq_hz: Float) -> Float:
+        """Sum of |I| + P of all sources, Jy (F,)."""
+        freq_hz = np.atleast_1d(freq_hz)
+        step = max(1, int(FLUX_CELLS / len(self)))
+        pieces = [freq_hz[f : f + step] for f in range(0, len(freq_hz), step)]
+        return np.concatenate([power(self.stokes(piece)).sum(axis=-1) for piece in pieces])
+
+    def nonzero(self, freq_hz: Float) -> tuple[bool, bool, bool, bool]:
         """Which of I, Q, U, V differ from zero in any source and channel."""
         found = np.any(self.stokes(freq_hz) != 0, axis=(0, 1))
         return tuple(bool(x) for x in found)  # type: ignore[return-value]
+
+
+def points_of(sky: Sky) -> PointSky | None:
+    """A sky as the list of sources that it is; `None` when it is none."""
+    return sky if isinstance(sky, PointSky) else None

@@ -2,36 +2,31 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from instrument.jones.mueller import stokes
 from instrument.mat2 import UNIT
 from instrument.observe.directions import LIGHT
 from instrument.observe.sampling import Sampling
-from instrument.sky.base import Sky
-from instrument.sky.points import PointSky
+from instrument.sky.base import PlacedSky, polarized, power
+from instrument.sky.image import ImageSky
+from instrument.sky.points import PointSky, points_of
 from instrument.units import Float
 
-FLUX_CELLS = 2e6  # entries (T, F, S) worked out at once
+
+def flux(sky: PlacedSky, at: Sampling) -> Float:
+    """|I| + P towards the outline of a sky, Jy (T, F, N), length 1 where constant; of an image in its cells."""
+    listed = points_of(sky)
+    if listed is not None:
+        return power(listed.stokes(at.freq_hz))[None]
+    if isinstance(sky, ImageSky):
+        return sky.cells_jy(at.freq_hz)[None]
+    return power(np.asarray(stokes(sky.brightness(at)).real))
 
 
-def polarized(stokes_jy: Float) -> Float:
-    """P = sqrt(Q^2 + U^2 + V^2) of Stokes I, Q, U, V (..., 4); `hypot`, for the squares of 1e155 Jy are no floats."""
-    return np.asarray(np.hypot(np.hypot(stokes_jy[..., 1], stokes_jy[..., 2]), stokes_jy[..., 3]))
-
-
-def flux(sky: Sky, at: Sampling) -> Float:
-    """|I| + P, the largest singular value of the brightness, Jy (T, F, S), length 1 where constant."""
-    listed = sky.sources()
-    found: Any = listed.stokes(at.freq_hz)[None] if listed is not None else stokes(sky.brightness(at)).real
-    return np.asarray(np.abs(found[..., 0]) + polarized(found))
-
-
-def brightness_rounding(sky: Sky, at: Sampling) -> Float:
-    """Bound on the rounding of the brightness of each source, Jy (T, F, S), length 1 where constant."""
-    listed = sky.sources()
+def brightness_rounding(sky: PlacedSky, at: Sampling) -> Float:
+    """Bound on the rounding of the brightness of each source, Jy (T, F, N), length 1 where constant."""
+    listed = points_of(sky)
     return UNIT * (8 * flux(sky, at) if listed is None else _of_list(listed, at.freq_hz)[None])
 
 

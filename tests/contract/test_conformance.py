@@ -26,7 +26,7 @@ from instrument import (
 from instrument.component import Component
 from instrument.conformance import Report, check
 from instrument.conformance.bench import bench, hard_places, lofar_like, random_sky
-from instrument.errors import InputError, InstrumentError, Outcome
+from instrument.errors import InputError, InstrumentError, Outcome, RefusedError
 from instrument.experiments.many_directions import ManyDirections
 from instrument.foreground.base import ForegroundRemover
 from instrument.foreground.linear import projection
@@ -34,8 +34,8 @@ from instrument.jones.base import ElementBeam, JonesTerm
 from instrument.jones.station import ArrayFactor, Level
 from instrument.mat2 import IDENTITY
 from instrument.model import Instrument
-from instrument.predict.base import Work
-from instrument.predict.direct import Direct
+from instrument.predict.base import Blockwise, Work
+from instrument.predict.direct import Direct, DirectImages
 from instrument.registry import KINDS, available, load
 
 SETTINGS: dict[tuple[str, ...], list[dict[str, Any]]] = {
@@ -411,9 +411,19 @@ class Amplifies(FineSky):
         return 2 * super().envelope(at, uvw_lambda)
 
 
-class OtherSources(FineSky):
-    def sources(self):
-        return random_sky(bench().centre, polarized=False, gaussian=False, seed=9)
+class HidesFlux(FineSky):
+    def total_jy(self, freq_hz):
+        return 0.99 * super().total_jy(freq_hz)
+
+
+class KnowsNoV(FineSky):
+    def nonzero(self, freq_hz):
+        return (True, True, True, False)
+
+
+class LosesARest(FineSky):
+    def parts(self, most, freq_hz):
+        return list(super().parts(most, freq_hz))[:-1]
 
 
 class ChangesFrequencies(FineSky):
@@ -431,7 +441,9 @@ BROKEN_SKIES = [
     (NotHermitian, "its brightness is hermitian"),
     (BlockwiseSky, "a block of its brightness equals the slice of the whole"),
     (Amplifies, "its envelope takes nothing off a baseline of zero"),
-    (OtherSources, "its list of sources is the sky"),
+    (HidesFlux, "its total is that of its brightness"),
+    (KnowsNoV, "stokes parameters that it says are zero are zero"),
+    (LosesARest, "its parts are the whole"),
     (ChangesFrequencies, "a call of its brightness has no side effects"),
 ]
 
@@ -443,7 +455,7 @@ class RefusesAll(Direct):
 
 class RefusesSilently(Direct):
     def refuses(self, problem):
-        return "" if problem.sky.sources() is None else None
+        return "" if problem.sky.kind == "other" else None
 
 
 class TurnsFringes(Direct):
@@ -459,9 +471,8 @@ class IgnoresTheOrderOfBaselines(Direct):
 
 class ForgetsShapes(Direct):
     def sums(self, problem):
-        sky = problem.sky.sources() or problem.sky
         points = dict.fromkeys(("major_rad", "minor_rad", "angle_rad"))
-        sky = sky.with_fields(**points) if sky.sources() else sky
+        sky = problem.sky.with_fields(**points) if problem.sky.kind == "points" else problem.sky
         return super().sums(type(problem)(**{**vars(problem), "sky": sky}))
 
 
@@ -471,14 +482,66 @@ class FirstTimeOnly(Direct):
         return np.repeat(one, problem.shape[0], axis=0)
 
 
+class KnowsNoPairs(Direct):
+    def prepare(self, problem, tolerance):
+        return _AllBaselines(self, problem)
+
+
+class _AllBaselines(Blockwise):
+    def sums(self, times, channels, pairs=None):
+        found = super().sums(times, channels)
+        return found if pairs is None else found[:, :, : len(pairs[0])]
+
+
+class ConjugateAdjoint(Direct):
+    def prepare(self, problem, tolerance):
+        return _Conjugate(self, problem) if problem.sky.kind == "image" else Blockwise(self, problem)
+
+
+class _Conjugate(DirectImages):
+    def adjoint(self, data, times, channels, pairs=None):
+        return super().adjoint(data.conj(), times, channels, pairs)
+
+
+class NoOperator(Direct):
+    def prepare(self, problem, tolerance):
+        return Blockwise(self, problem)
+
+
+class Drifting(Direct):
+    """Wrong by up to 3e-7, in a way that comes back with every atom of two times, and says so: sound."""
+
+    claimed: tuple[int, int] = (2, 1)
+    bound: float = 1e-6
+
+    def prepare(self, problem, tolerance):
+        if tolerance < self.bound:
+            raise RefusedError(f"drifts by {self.bound:g}: give a tolerance of that")
+        return _Drift(self, problem, self.bound, self.claimed)
+
+    def refuses(self, problem):
+        return "knows no images" if problem.sky.kind == "image" else None
+
+
+class _Drift(Blockwise):
+    def sums(self, times, channels, pairs=None):
+        found = super().sums(times, channels, pairs)
+        return found * (1 + 3e-7 * (np.arange(len(found)) % 2))[:, None, None, None, None]
+
+
 class CostsNothing(Direct):
     def work(self, problem):
         return Work(0.0, 0.0, 1.0, 1.0)
 
 
 class OtherInterval(Direct):
-    def predict(self, problem):
-        return super().predict(type(problem)(**{**vars(problem), "interval_s": 99.0}))
+    def prepare(self, problem, tolerance):
+        return _Seconds99(self, problem)
+
+
+class _Seconds99(Blockwise):
+    def predict(self, times, channels):
+        return replace(super().predict(times, channels), interval_s=99.0)
 
 
 class SortsAntennas(Direct):
@@ -494,7 +557,12 @@ BROKEN_ENGINES = [
     (TurnsFringes(), "it agrees with direct: one source"),
     (IgnoresTheOrderOfBaselines(), "it agrees with direct: polarized points, phased stations"),
     (ForgetsShapes(), "it agrees with direct: points and Gaussians, phased stations"),
-    (FirstTimeOnly(), "a block of its sums equals the slice of the whole"),
+    (FirstTimeOnly(), "a block of whole atoms equals the slice of the whole"),
+    (KnowsNoPairs(), "some pairs of antennas have the sums they have among all"),
+    (ConjugateAdjoint(), "its adjoint is that of its sums: an image, phased stations"),
+    (NoOperator(), "its adjoint is that of its sums: an image, no Jones term"),
+    (Drifting(claimed=(1, 1)), "a block of whole atoms equals the slice of the whole"),
+    (Drifting(bound=1e-8), "it agrees with direct: one source"),
     (CostsNothing(), "its work is positive and grows with the problem"),
     (OtherInterval(), "its visibilities carry their coordinates"),
     (SortsAntennas(), "a call of its sums has no side effects"),
@@ -590,7 +658,9 @@ def test_what_breaks_a_claim_is_caught_by_it(broken, claim):
     assert claim in [line.claim for line in report.failed], str(report)
 
 
-@pytest.mark.parametrize("sound", [Fine(), a_sky(FineSky), Direct(), FineRemover()], ids=lambda x: type(x).__name__)
+@pytest.mark.parametrize(
+    "sound", [Fine(), a_sky(FineSky), Direct(), Drifting(), FineRemover()], ids=lambda x: type(x).__name__
+)
 def test_what_the_broken_ones_deviate_from_passes(sound):
     check(sound).raise_if_failed()
 

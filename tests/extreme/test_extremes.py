@@ -139,7 +139,7 @@ def exact_visibility(problem, t, f, b):
     baseline = [Decimal(float(x)) - Decimal(float(y)) for x, y in zip(p, q, strict=True)]
     uvw = [dot(row, baseline) * Decimal(float(at.freq_hz[f])) / Decimal(LIGHT) for row in axes]
     real = imag = Decimal(0)
-    for ra, dec, flux in zip(at.ra_rad, at.dec_rad, problem.sky.sources().stokes_jy[:, 0], strict=True):
+    for ra, dec, flux in zip(at.ra_rad, at.dec_rad, problem.sky.stokes_jy[:, 0], strict=True):
         towards = exact_axes(ra, dec)[2]
         l, m, n = (dot(row, towards) for row in rows)
         c, s = cos_sin(2 * PI * dot(uvw, [l, m, n - 1]))

@@ -125,7 +125,7 @@ def calls():
         ("PointSky.brightness", w.sky.brightness, {"at": w.at}),
         ("PointSky.distance_rad", w.sky.distance_rad, {"centre": ins.Direction(2.1, 0.8)}),
         ("PointSky.shape_axes", w.sky.shape_axes, {"centre": ins.Direction(2.1, 0.8)}),
-        ("PointSky.flux_kinds", w.sky.flux_kinds, {"freq_hz": np.array([1.5e8])}),
+        ("PointSky.nonzero", w.sky.nonzero, {"freq_hz": np.array([1.5e8])}),
         ("GainTerm.jones", w.terms.terms[0].jones, {"at": w.at}),
         ("GainTerm.simplify", w.terms.terms[0].simplify, {"at": w.at, "tolerance": 0.0}),
         ("GainTerm.peak", w.terms.terms[0].peak, {"at": w.at}),

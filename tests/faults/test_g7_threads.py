@@ -50,7 +50,7 @@ def plan():
 
 
 def test_g7_blocks_of_the_laboratories_leave_the_threads_alone(plan, two):
-    sky = plan.problem.sky.sources()
+    sky = plan.problem.sky
     incomplete = incomplete_model._Job(IncompleteModel(models=(2, 4)), plan, sky, ranks(sky))
     settings = ManyDirections(clusters=2)
     many = many_directions._Job(settings, plan, sky, np.array([0, 0, 1, 1]))

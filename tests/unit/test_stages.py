@@ -73,7 +73,7 @@ def test_what_a_run_finds_is_what_the_same_steps_find_by_hand_to_the_last_bit(tm
     file = parse(tables)
     scene = file.scene()
     plan = file.plan(scene)
-    sums = ForcedPhotometry().start(plan.problem.sky.sources())
+    sums = ForcedPhotometry().start(plan.problem.sky)
     for block in plan.blocks():
         sums.add(block.with_noise(2820 * u.Jy, seed=5003).without_beam(scene.instrument))
     fluxes = sums.finish()

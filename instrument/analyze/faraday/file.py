@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from instrument.observe.grid import ImageGrid
 from instrument.provenance import fits_cards
-from instrument.units import Direction
 from instrument.whole_file import whole_file
 
 if TYPE_CHECKING:
@@ -19,14 +19,11 @@ def sky_header(cube: FaradayCube) -> Any:
     """FITS header of the first two axes, RA and DEC, SIN projection about the centre pixel."""
     from astropy.io import fits
 
-    ny, nx = cube.data.shape[1:]
-    step, centre = float(np.rad2deg(cube.pixel_rad)), cube.centre or Direction(0.0, 0.0)
     header = fits.Header()
-    for i, (kind, value, delta, n) in enumerate(
-        (("RA---SIN", centre.ra_rad, -step, nx), ("DEC--SIN", centre.dec_rad, step, ny)), 1
-    ):
+    grid = ImageGrid.of(cube.data.shape, cube.pixel_rad, cube.centre)
+    for i, (kind, value, delta, middle) in enumerate(grid.fits_axes, 1):
         header[f"CTYPE{i}"], header[f"CUNIT{i}"] = kind, "deg"
-        header[f"CRVAL{i}"], header[f"CDELT{i}"], header[f"CRPIX{i}"] = np.rad2deg(value), delta, float(n // 2 + 1)
+        header[f"CRVAL{i}"], header[f"CDELT{i}"], header[f"CRPIX{i}"] = value, delta, middle
     header["RADESYS"] = "ICRS"
     return header
 

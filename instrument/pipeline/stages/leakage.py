@@ -17,6 +17,7 @@ from instrument.observe.sampling import Sampling
 from instrument.pipeline.stage import Draw, Running, StageResult, StageRun
 from instrument.plan import Plan
 from instrument.report.page import Block, Card, Details, Figures, Section, Table, number
+from instrument.sky.points import points_of
 from instrument.units import Direction, Float
 from instrument.visibilities import Visibilities
 
@@ -31,7 +32,7 @@ class LeakageRun(StageRun):
     """Measures the fluxes of all sources of a sky that is a list of them."""
 
     def __init__(self, run: Running, photometry: ForcedPhotometry) -> None:
-        sky = run.plan.problem.sky.sources()
+        sky = points_of(run.plan.problem.sky)
         if sky is None:
             raise InputError("[analyze] products = ['leakage'] needs a sky that is a list of sources")
         self.run = run

@@ -1,0 +1,39 @@
+"""ImageOperator: an engine made ready for images: the visibilities of any image, and the image of any visibilities."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+from instrument.predict.base import Prepared
+from instrument.sky.image import ImageSky
+from instrument.units import Complex, Float, Int
+
+
+class ImageOperator(Prepared):
+    """The linear map A of images x, real (F, 4, Ny, Nx), to visibilities (T, F, B, 2, 2), and its exact adjoint.
+
+    Exact means: Re sum conj(y) A x = sum x A^H y to rounding for all x and y, however well A approximates the sums; so
+    both use the same numbers. The grid is that of the sky of the problem, and A x for its images are the sums.
+    """
+
+    @property
+    def sky(self) -> ImageSky:
+        """The sky of the problem, an image."""
+        sky = self.problem.sky
+        assert isinstance(sky, ImageSky)  # or it would have been refused
+        return sky
+
+    @abstractmethod
+    def forward(self, images: Float, times: slice, channels: slice, pairs: tuple[Int, Int] | None = None) -> Complex:
+        """A x: visibilities in Jy, complex (T, F, B, 2, 2), of images (F, 4, Ny, Nx) of these channels in Jy/pixel."""
+
+    @abstractmethod
+    def adjoint(self, data: Complex, times: slice, channels: slice, pairs: tuple[Int, Int] | None = None) -> Float:
+        """A^H y: images, real (F, 4, Ny, Nx), of visibilities (T, F, B, 2, 2) of whole atoms; those of blocks add up.
+
+        No weights and no normalisation: multiply the data by weights, divide by what the sum of them needs.
+        """
+
+    def sums(self, times: slice, channels: slice, pairs: tuple[Int, Int] | None = None) -> Complex:
+        """Visibilities in Jy, complex (T, F, B, 2, 2), of the images of the sky."""
+        return self.forward(self.sky.planes(self.problem.at.freq_hz[channels]), times, channels, pairs)
