@@ -29,8 +29,9 @@ class Direct(Predictor):
         times, channels, baselines = problem.shape
         stations, sources = problem.at.shape[2], problem.sky.count
         units = times * channels * baselines * sources
-        at_once = min(sources, CHUNK)
-        held = times * channels * at_once * (64 * stations * 3 + 64 * 6) + 64 * times * channels * baselines
+        # measured, 4 to 59 stations: four Jones matrices and terms of one in all, directions in the axes of a station
+        held = times * min(sources, CHUNK) * (channels * (275 * stations + 110) + 85 * stations)
+        held += 64 * times * channels * baselines
         return Work(150.0 * units, 0.0, float(held), 150e-9 * units + 1e-4 * baselines)
 
     def sums(self, problem: Problem) -> Complex:

@@ -35,6 +35,7 @@ NOT_WALKED |= {
     "StageResult",
     "VisibilitySet",
 }  # those of others are
+NOT_WALKED |= {"Prepared", "ImageOperator", "Work"}  # between engines and plans
 # (what, argument, poison): why it is accepted
 MEANT: dict[tuple[str, str, str], str] = {
     ("Analyzer.rm_synthesis", "divide_by_i", "True"): "by the way that suits the signal",
@@ -54,6 +55,7 @@ class World:
         self.terms = ins.Chain(ins.GainTerm(rms=0.1))
         self.instrument = ins.Composed(stations=self.layout, terms=self.terms)
         self.sky = ins.PointSky.at(CENTRE, [3.0])
+        self.pixels = ins.ImageSky(grid=ins.ImageGrid(pixels=4, pixel=1 * u.deg), stokes=np.ones((1, 4, 4, 4)))
         self.observation = ins.Observation(
             phase_centre=CENTRE,
             start="2012-12-07T23:00:00",
@@ -126,6 +128,12 @@ def calls():
         ("PointSky.distance_rad", w.sky.distance_rad, {"centre": ins.Direction(2.1, 0.8)}),
         ("PointSky.shape_axes", w.sky.shape_axes, {"centre": ins.Direction(2.1, 0.8)}),
         ("PointSky.nonzero", w.sky.nonzero, {"freq_hz": np.array([1.5e8])}),
+        ("ImageGrid", ins.ImageGrid, {"pixels": 4, "pixel": 1 * u.arcmin, "centre": CENTRE}),
+        ("ImageSky", ins.ImageSky, {
+            "grid": w.pixels.grid, "stokes": np.ones((1, 4, 4, 4)), "frequencies": [150] * u.MHz}),
+        ("ImageSky.about", w.pixels.about, {"centre": ins.Direction(2.1, 0.8)}),
+        ("ImageSky.planes", w.pixels.planes, {"freq_hz": np.array([1.5e8])}),
+        ("ImageSky.total_jy", w.pixels.total_jy, {"freq_hz": np.array([1.5e8])}),
         ("GainTerm.jones", w.terms.terms[0].jones, {"at": w.at}),
         ("GainTerm.simplify", w.terms.terms[0].simplify, {"at": w.at, "tolerance": 0.0}),
         ("GainTerm.peak", w.terms.terms[0].peak, {"at": w.at}),
