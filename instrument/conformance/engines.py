@@ -79,8 +79,8 @@ def its_adjoint_is_that_of_its_sums(engine: Predictor, problem: Problem) -> str:
     y is A x and as much noise: a random y alone is nearly orthogonal to A x and would tell nothing.
     """
     ready = prepared(engine, problem)
-    demand(isinstance(ready, ImageOperator), f"it prepares a {type(ready).__name__} for images: give an ImageOperator")
-    assert isinstance(ready, ImageOperator)
+    if not isinstance(ready, ImageOperator):
+        return "it has none"
     rng = np.random.default_rng(0)
     x = rng.normal(size=(problem.shape[1], 4, *ready.sky.grid.pixels))
     seen = ready.forward(x, EVERY, EVERY)

@@ -503,11 +503,6 @@ class _Conjugate(DirectImages):
         return super().adjoint(data.conj(), times, channels, pairs)
 
 
-class NoOperator(Direct):
-    def prepare(self, problem, tolerance):
-        return Blockwise(self, problem)
-
-
 class Drifting(Direct):
     """Wrong by up to 3e-7, in a way that comes back with every atom of two times, and says so: sound."""
 
@@ -560,7 +555,6 @@ BROKEN_ENGINES = [
     (FirstTimeOnly(), "a block of whole atoms equals the slice of the whole"),
     (KnowsNoPairs(), "some pairs of antennas have the sums they have among all"),
     (ConjugateAdjoint(), "its adjoint is that of its sums: an image, phased stations"),
-    (NoOperator(), "its adjoint is that of its sums: an image, no Jones term"),
     (Drifting(claimed=(1, 1)), "a block of whole atoms equals the slice of the whole"),
     (Drifting(bound=1e-8), "it agrees with direct: one source"),
     (CostsNothing(), "its work is positive and grows with the problem"),
