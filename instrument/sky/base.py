@@ -15,7 +15,6 @@ from instrument.observe.sampling import Sampling
 from instrument.units import Complex, Direction, Float
 
 
-@checked
 class Sky(Component):
     """What is looked at; `about` a phase centre it is a `PlacedSky`, which is its own answer.
 
@@ -34,6 +33,10 @@ class Sky(Component):
 
     def brightness(self, at: Sampling) -> Complex:
         """Brightness matrices (T, F, S, 2, 2); raises `InputError` before it is placed."""
+        raise self._unplaced()
+
+    def envelope(self, at: Sampling, uvw_lambda: Float) -> Float | None:
+        """What shapes take off visibilities, (T, F, B, S); raises `InputError` before it is placed."""
         raise self._unplaced()
 
     def _unplaced(self) -> InputError:
