@@ -119,6 +119,15 @@ class Component(BaseModel, ABC):
             kept[name] = _at_the_door(type(self), name, value)
         return type(self)(**kept, **fields)
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        try:
+            super().__setattr__(name, value)
+        except ValidationError:
+            raise InputError(f"{type(self).__name__} is frozen: use .with_fields({name}=...), a copy") from None
+
+    def __delattr__(self, name: str) -> None:
+        raise InputError(f"{type(self).__name__} is frozen: '{name}' stays")
+
     def fingerprint(self) -> str:
         """Hex digest of the fields: equal components have equal fingerprints."""
         # -0.0 equals 0.0

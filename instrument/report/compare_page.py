@@ -67,12 +67,16 @@ def page_of_comparison(found: Compared, draw: Callable[..., FigureEntry]) -> Pag
         sections.append(Section("The same in both", [Text("; ".join(same))]))
     return Page(
         title=f"{first.label} and {second.label}",
-        subtitle=f"{first.text('name')}, {first.text('finished')}; {second.text('name')}, {second.text('finished')}",
+        subtitle="; ".join(f"{run.text('name')}, finished {_when(run)}" for run in (first, second)),
         verdict="Two runs compared.",
         cards=[Card(TITLES[name], str(len(changes)), "differ") for name, changes in found.parts() if changes],
         sections=[section for section in sections if section.blocks],
         footer=f"instrument {first.part('versions').get('instrument', '')}",
     )
+
+
+def _when(run: Any) -> str:
+    return str(run.text("finished")).replace("T", " ").replace("+00:00", " UTC")
 
 
 def _changes(changes: list[Any], first: Run, second: Run) -> list[Block]:
@@ -138,7 +142,7 @@ def two_spectra(one: Any, two: Any, wave: str, labels: tuple[str, str], ax: Axes
     unit = one["power"].unit
     ax.set(
         xlabel=r"$k_\perp$ (1/Mpc)" if wave == "k_perp" else r"$k$ (1/Mpc)",
-        ylabel=f"power ({unit})" if unit else "power",
+        ylabel=f"power ({unit:latex_inline})" if unit else "power",
     )
     ax.grid(color="#dddddd", lw=0.6)
     ax.legend(loc="upper center", bbox_to_anchor=(0.46, -0.16), ncols=2, frameon=False)

@@ -60,7 +60,9 @@ class GridSky(GeneratedSky):
         if not np.sqrt(np.sum(np.square(self.polarization))) <= 1:
             raise InputError(f"polarization = {self.polarization} are fractions of I: together at most 1")
         if min(self.flux, self.centre_flux or 0.0) < 0:
-            warn(f"flux = {self.flux:g} Jy, centre_flux = {self.centre_flux}: a negative flux is taken as it stands")
+            given = {"flux": self.flux, "centre_flux": self.centre_flux}
+            named = [f"{name} = {value:g} Jy" for name, value in given.items() if (value or 0) < 0]
+            warn(f"{', '.join(named)}: a negative flux is taken as it stands")
         if self.centre_flux is not None and not (self.shape[0] % 2 and self.shape[1] % 2):
             raise InputError(f"centre_flux needs odd numbers: a grid of {self.shape} has no source at its centre")
         return self

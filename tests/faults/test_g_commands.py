@@ -2,7 +2,9 @@
 
 import ast
 import json
+import os
 import re
+import subprocess
 import sys
 import warnings
 from pathlib import Path
@@ -309,3 +311,68 @@ def test_g12_there_is_one_helper_for_warnings():
         if isinstance(node, ast.Call) and ast.unparse(node.func) == "warnings.warn" and path.name != "errors.py"
     ]
     assert found == []
+
+
+# G5, G9: what goes wrong is one line -------------------------------------------------------------------------------
+
+
+def test_g5_a_field_that_is_assigned_is_one_line_with_the_remedy():
+    imager = ins.Imager(pixels=32, pixel=1 * u.arcmin)
+    for name, value in (("pixels", 64), ("none", 1)):
+        with pytest.raises(InputError, match=rf"^Imager is frozen: use .with_fields\({name}=...\), a copy$"):
+            setattr(imager, name, value)
+    with pytest.raises(InputError, match=r"^Imager is frozen: .pixels. stays$"):
+        del imager.pixels
+    assert imager.pixels == 32 and imager.with_fields(pixels=64).pixels == 64
+
+
+def test_g5_places_that_are_not_there_and_lists_for_one_value(tmp_path, world):
+    for write in (world.cube.write, world.vis.save, world.cylinders.write):
+        with pytest.raises(InputError, match="none/x cannot be written: No such file or directory"):
+            write(tmp_path / "none" / "x")
+    with pytest.raises(InputError, match="sefd takes one value"):
+        world.vis.with_noise(sefd=[1, 2] * u.Jy, seed=1)
+    assert not [*tmp_path.iterdir()]
+
+
+def test_g5_a_terminal_of_ascii_shows_all_text():
+    script = "from instrument.terminal import process, show\nprocess(lambda: show('k\\u22a5 \\u2192') or 0)"
+    done = subprocess.run(
+        [sys.executable, "-c", script], env={**os.environ, "PYTHONIOENCODING": "ascii"}, capture_output=True, check=True
+    )
+    assert done.stdout == b"k\\u22a5 \\u2192\n" and done.stderr == b""
+
+
+def test_g5_a_scene_that_may_not_be_read_is_one_line(here, capsys, monkeypatch):
+    def forbidden(*_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("os.open", forbidden)
+    status, _, said = said_by(capsys, "plan", "s.toml")
+    assert (status, said) == (2, "instrument: scene file 's.toml' cannot be opened: Permission denied\n")
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        (b"\xef\xbb\xbf" + TINY.encode(), None),
+        (TINY.replace("tiny", "caf\xe9").encode("latin-1"), "line 1: byte 0xe9 is not UTF-8 (Latin-1?)"),
+        (TINY.encode("utf-16"), "is UTF-16 or UTF-32 text: a scene file is TOML in UTF-8"),
+        (b"\x89PNG\r\n\x1a\n", "is a PNG image"),
+        (TINY.replace("[sky]", "[sky]\ncount = 2").encode(), "(at line 15, column 10): count"),
+    ],
+)
+def test_g9_scenes_that_are_none(here, capsys, content, text):
+    (here / "s.toml").write_bytes(content)
+    status, _, said = said_by(capsys, "plan", "s.toml")
+    assert status == (2 if text else 0) and said.count("\n") == (1 if text else 0)
+    assert not text or text in said
+
+
+def test_g9_a_redshift_beside_the_band_and_a_negative_flux_are_said_by_the_plan(here, capsys):
+    change = ["observation.frequency.channels=16", "analyze.products=[]", "analyze.cube={redshift=3}"]
+    change += ["sky={kind='grid',shape=[2,2],spacing='1 deg',flux='-5 Jy'}"]
+    status, _, said = said_by(capsys, "plan", "s.toml", *(word for one in change for word in ("--set", one)))
+    assert status == 0
+    assert "redshift = 3 has its 21-cm line at 355.1 MHz, the cube is at 148.6 to 151.4 MHz, z = 8.47" in said
+    assert "warning: flux = -5 Jy: a negative flux is taken as it stands" in said

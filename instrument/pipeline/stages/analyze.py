@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 
 from instrument.analyze.analyzer import Analyzer
+from instrument.analyze.power.fourier import check_redshift
 from instrument.analyze.power.spectra import Spectrum2D
 from instrument.analyze.sources.photometry import ForcedPhotometry
 from instrument.errors import InputError, unused
@@ -47,12 +48,15 @@ class Analyze(Stage):
         return (self.uv_range,) if "leakage" in self.products else ()
 
     def check(self, scene: Scene) -> None:
-        """Name settings of products that are not made; refuse products that one channel does not allow."""
+        """Name settings of products that are not made, and a redshift off the band; refuse what one channel lacks."""
         if "leakage" not in self.products:
             given = [key for key in ("uv_range", "every") if key in self.model_fields_set]
             unused("[analyze]", given, "they are of the product 'leakage'")
+        freq = scene.observation.freq_hz
+        if self.cube is not None:  # said before the run, not at its end
+            check_redshift(self.cube.redshift, float(freq.min()), float(freq.max()))
         asked = [name for name in (self.cube and self.cube.products) or () if name != "spectrum-2d"]
-        if asked and scene.observation.freq_hz.size < 2:
+        if asked and freq.size < 2:
             raise InputError(f"[analyze.cube] products = '{asked[0]}': one channel; give more, or take 'spectrum-2d'")
 
     def start(self, run: Running) -> StageRun:
