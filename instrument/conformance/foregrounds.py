@@ -7,6 +7,7 @@ import numpy as np
 from instrument.conformance.bench import demand, demand_repeatable, demand_same
 from instrument.errors import Outcome
 from instrument.foreground.base import ForegroundRemover
+from instrument.foreground.maps import Usable
 from instrument.image.cube import StokesCube
 from instrument.units import Float
 
@@ -38,8 +39,8 @@ def foreground_cube() -> tuple[StokesCube, Float]:
 def its_separation_is_of_known_words_and_shapes(remover: ForegroundRemover) -> str:
     """Outcome, a remark in one line, mixing (C, n), components (n, Ny, Nx), an operator or a foreground, all finite."""
     cube, _ = foreground_cube()
-    maps = cube.data[:, "IQUV".index(remover.stokes)]
-    found = remover.separate(maps, cube.freq_hz)
+    given = Usable.of(cube, remover.stokes, remover.planes).maps
+    maps, found = given.plane, remover.separate(given)
     demand(isinstance(found.outcome, Outcome), f"outcome = {found.outcome!r}")
     demand(bool(found.remark) and "\n" not in found.remark, f"remark = {found.remark!r}")
     n = found.mixing.shape[1]
@@ -86,6 +87,11 @@ def what_has_no_data_comes_back_as_nan_and_changes_nothing_else(remover: Foregro
         holes = np.isnan(maps)
         demand(holes[:, [5, 9], [6, 9]].all(), f"a pixel without data comes back in the {name} with numbers")
         demand(holes.sum() == 2 * len(maps), f"{holes.sum()} voxels of the {name} are NaN, {2 * len(maps)} were due")
+    for plane in remover.planes:
+        data = cube.data.copy()
+        data[3, "IQUV".index(plane), 5, 6] = np.nan
+        holes = np.isnan(remover.split(cube.with_data(data)).residual.data[:, s])
+        demand(holes[:, 5, 6].all() and holes.sum() == len(holes), f"a pixel without {plane} comes back with numbers")
     return ""
 
 

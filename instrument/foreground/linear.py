@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from instrument.errors import Outcome
+from instrument.foreground.separation import Separation
+from instrument.foreground.separation import apply as apply
 from instrument.units import Bool, Float
-
-if TYPE_CHECKING:
-    from instrument.errors import Outcome
-    from instrument.foreground.base import Separation
 
 RANGE = 1e-4  # of the largest eigenvalue that one covariance is trusted for: vectors of it are right to 1e-12
 CHUNK = 16384  # pixels turned to float64 at once: 21 MB at 161 channels
@@ -93,8 +92,6 @@ def projection(
     Mixing has unit columns of positive sum, ordered by the power of their components S = A^+ X. Directions below
     `rank` of the largest singular value of A are left out of A^+.
     """
-    from instrument.foreground.base import Separation
-
     length = np.sqrt((columns**2).sum(axis=0))
     a = columns / np.where(length > 0, length, 1.0)
     a = a * np.where(a.sum(axis=0) < 0, -1.0, 1.0)
@@ -106,9 +103,3 @@ def projection(
     order = np.argsort(-power, kind="stable")
     a, unmix, components = a[:, order], unmix[order], components[order]
     return Separation(outcome, remark, a, components, operator=basis @ basis.T, basis=basis, adapted=adapted)
-
-
-def apply(matrix: Any, maps: Any) -> Any:
-    """matrix @ maps over the channels (n, Ny, Nx), in the precision of the maps."""
-    flat = maps.reshape(len(maps), -1)
-    return (matrix.astype(flat.dtype) @ flat).reshape(len(matrix), *maps.shape[1:])

@@ -109,9 +109,10 @@ def signal_loss(
     s = "IQUV".index(remover.stokes)
     if not np.isfinite(signal.data[:, s]).all() or not signal.data[:, s].any():
         raise InputError(f"{remover.stokes} of the signal is not finite everywhere, or zero everywhere")
-    data = np.zeros(cube.data.shape, np.result_type(cube.data.dtype, signal.data.dtype))
+    data = np.array(cube.data, np.result_type(cube.data.dtype, signal.data.dtype))
     data[:, s] = cube.data[:, s] + signal.data[:, s]
     left = remover.split(cube.with_data(data)).residual.data[:, s]
+    data[:] = 0
     data[:, s] = left - remover.split(cube).residual.data[:, s]
     difference = cube.with_data(data)
     injected = np.zeros_like(data)

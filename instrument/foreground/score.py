@@ -23,23 +23,20 @@ from typing import Any
 
 import numpy as np
 
-from instrument.analyze.power.fourier import comoving, line_of_sight, taper_of
+from instrument.analyze.power.fourier import comoving, taper_of
 from instrument.errors import InputError
-from instrument.foreground.linear import apply, covariance, one_thread
+from instrument.foreground.linear import apply
+from instrument.foreground.noise import delay, measured_noise, spectra
 from instrument.shown import short_repr
 from instrument.units import Bool, Float
 
-NOISE_FROM = 0.3  # 1/Mpc: delays beyond it hold noise
-PROBES = 32  # spectra of those delays in which the noise of each cell is measured: to 18 %, their sum to far better
 DRAW = 0.3  # of the noise, added to see what an adapted remover makes of it: a smaller one scatters more
 UNSURE = 0.3  # of a score: a scatter beyond which a second draw is made
 MOST_DRAWS = 6  # made while it is not told from 1 and the draws are what leaves it open
 OWN = 8  # stream of the draws: of its seed alone a mock of noise of the same seed would be the same noise again
 QUIET = 5e-3  # of a score: a smaller scatter is in none of the digits that are printed
 TURNS = 1.5  # a draw that scatters more in g(x + e w) than in the covariance alone: g(x) is taken for r then
-LEAST = 4  # delays of noise
 SMALL = 1e-8  # of the trace, on the diagonal of the fit to a draw: fewer pixels than channels leave it singular
-RIDGE = 1e-2  # of the least squares for the noise of channels, towards their mean
 
 
 @dataclass(frozen=True)
@@ -110,10 +107,10 @@ def estimated_score(
 ) -> Score:
     """Score from maps (C, Ny, Nx) alone; `again` runs an adapted remover once more, else `operator` (C, C) is it."""
     modes, cells = _modes(freq_hz, k_par, taper), _cells(freq_hz, pixel_rad, maps.shape[1:], k_perp)
-    noise, scale, probes = _noise(maps, freq_hz)
+    noise, scale, probes = measured_noise(maps, freq_hz)
     noise_here = noise[cells]
     level = np.trace(modes.T @ (scale[:, None] * modes))
-    seen, left = _spectra(modes, maps, cells), _spectra(modes, maps - found, cells)
+    seen, left = spectra(modes, maps, cells), spectra(modes, maps - found, cells)
     errors = _Errors(modes, scale, probes, noise_here, float(maps.any(axis=0).mean()))
     power = float(_power(seen).sum())
     before = power - float(noise_here.sum() * level)
@@ -128,7 +125,7 @@ def estimated_score(
         draw = _draw(noise, scale, maps, seed)
         moved = again(maps + draw.dtype.type(DRAW) * draw) - found
         response = modes.T @ operator if operator is not None else _response(modes, draw, moved)
-        one, two = _spectra(modes, draw, cells), _spectra(modes, moved, cells)
+        one, two = spectra(modes, draw, cells), spectra(modes, moved, cells)
         fitted = (one.real * two.real + one.imag * two.imag).sum(axis=0) / DRAW
         more = DRAW**2 * noise_here * np.trace(response @ (scale[:, None] * response.T))
         moving = _power(left - two) - _power(left) + 2 * fitted - more
@@ -216,47 +213,6 @@ def _response(modes: Float, draw: Any, moved: Any) -> Float:
     return np.asarray(np.linalg.solve(power + SMALL * np.trace(power) * np.eye(len(power)), moment.T).T)
 
 
-def noise_power(maps: Any, freq_hz: Float) -> tuple[Float, Float]:
-    """Noise power of every cell of the half plane (Ny, Nx // 2 + 1) and its shape over channels (C,), of mean 1.
-
-    From delays beyond 0.3 /Mpc: the complement of what is band-limited to less (eigenvectors of sinc(2 tau (f - f'))
-    above 1e-12, so channels may be uneven). Raises `InputError` where fewer than 4 are left.
-    """
-    return _noise(maps, freq_hz)[:2]
-
-
-def _noise(maps: Any, freq_hz: Float) -> tuple[Float, Float, Float]:
-    """As `noise_power`, and the spectra (C, K) in which the power was measured."""
-    from scipy.linalg import eigh
-
-    tau = _delay(freq_hz, NOISE_FROM)
-    with one_thread():
-        values, vectors = eigh(np.sinc(2 * tau * (freq_hz[:, None] - freq_hz)))
-    high = vectors[:, values < 1e-12 * values[-1]]
-    if high.shape[1] < LEAST:
-        raise InputError(f"{len(freq_hz)} channels leave {high.shape[1]} delays beyond {NOISE_FROM} /Mpc for the noise")
-    quiet = high @ high.T
-    found = np.diagonal(quiet @ covariance(maps) @ quiet)  # = quiet^2 shape
-    mean = max(float(found.sum()) / high.shape[1], np.finfo(float).tiny)
-    # these delays hardly reach the outermost channels: there the mean stands in
-    even = (quiet**2).T @ quiet**2 + RIDGE * np.eye(len(quiet))
-    shape = np.linalg.solve(even, (quiet**2).T @ (found / mean) + RIDGE)
-    shape = np.maximum(shape, 1e-3)
-    shape /= shape.mean()
-    turn = np.random.default_rng(1).standard_normal((high.shape[1], min(PROBES, high.shape[1])))
-    probes = high @ np.linalg.qr(turn)[0]
-    gain = np.einsum("cp,c,cp->p", probes, shape, probes)
-    cells = np.ones((maps.shape[1], maps.shape[2] // 2 + 1), bool)
-    power = (np.abs(_spectra(probes, maps, cells)) ** 2 / gain[:, None]).mean(axis=0)
-    return power.reshape(cells.shape), shape, probes
-
-
-def _delay(freq_hz: Float, k_par: float) -> float:
-    """Delay in s of a wavenumber in 1/Mpc, at the middle of the band."""
-    z, _ = comoving(float((freq_hz.min() + freq_hz.max()) / 2), None, None)
-    return k_par * line_of_sight(z, None) / (2 * np.pi)
-
-
 def _modes(freq_hz: Float, k_par: float, taper: str | None) -> Float:
     """Delays below k_par of the band's own spacing behind a taper, cosines and sines (C, m)."""
     step = np.diff(np.sort(freq_hz))
@@ -268,7 +224,7 @@ def _modes(freq_hz: Float, k_par: float, taper: str | None) -> Float:
     at = (freq_hz - freq_hz.min()) / spacing
     # a periodic taper has its largest value at n // 2
     window = np.interp(at, np.arange(n), taper_of(n, taper)) if n < 1 << 20 else np.ones(len(at))
-    count = int(np.floor(_delay(freq_hz, k_par) * span * (1 + 1e-9)))
+    count = int(np.floor(delay(freq_hz, k_par) * span * (1 + 1e-9)))
     phase = 2 * np.pi * np.multiply.outer(at / n, np.arange(1, min(count, (n - 1) // 2) + 1))
     root2 = np.sqrt(2.0)  # a delay stands for both of its signs
     return window[:, None] * np.hstack([np.ones((len(at), 1)), root2 * np.cos(phase), root2 * np.sin(phase)])
@@ -287,21 +243,13 @@ def _cells(freq_hz: Float, pixel_rad: float, shape: tuple[int, int], k_perp: tup
     return np.asarray(inside)
 
 
-def _spectra(modes: Float, maps: Any, cells: Bool) -> Any:
-    """Modes of the maps, transformed, in some cells (m, N)."""
-    from ducc0 import fft
-
-    found = apply(modes.T, maps)
-    return np.stack([fft.r2c(image, nthreads=0)[cells] for image in found])
-
-
 def _power(spectra: Any) -> Float:
     """Sum over modes (N,) of |spectra|^2 (m, N)."""
     return np.asarray((np.abs(spectra) ** 2).sum(axis=0, dtype=np.float64))
 
 
 def _powers(modes: Float, maps: Any, cells: Bool) -> Float:
-    return _power(_spectra(modes, maps, cells))
+    return _power(spectra(modes, maps, cells))
 
 
 def _draw(noise: Float, shape: Float, maps: Any, seed: int) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from pydantic import BeforeValidator
@@ -10,8 +10,9 @@ from pydantic import BeforeValidator
 from instrument.errors import Outcome
 from instrument.foreground.base import ForegroundRemover, Separation
 from instrument.foreground.linear import leading, projection
+from instrument.foreground.maps import StokesMaps
 from instrument.observe.directions import LIGHT
-from instrument.units import NOT_NEGATIVE, Float, Real, to_si
+from instrument.units import NOT_NEGATIVE, Real, to_si
 
 Depth = Annotated[
     float, NOT_NEGATIVE, BeforeValidator(lambda x: to_si(x, "rad/m2", "depth") if hasattr(x, "unit") else x)
@@ -28,8 +29,9 @@ class FaradayFilter(ForegroundRemover):
     depth: Depth = 3.0
     keep: Annotated[float, Real(above=0, below=1)] = 1e-9
 
-    def separate(self, maps: Any, freq_hz: Float) -> Separation:
+    def separate(self, given: StokesMaps) -> Separation:
         """Foreground V V^T X."""
+        maps, freq_hz = given.plane, given.freq_hz
         lambda2 = (LIGHT / freq_hz) ** 2
         kernel = np.sinc(2 * self.depth / np.pi * (lambda2[:, None] - lambda2))
         values, vectors = leading(kernel, len(kernel))

@@ -12,6 +12,7 @@ from instrument_plugins.foregrounds.starlet import GAINS, SMOOTH, starlet
 from instrument.errors import Outcome
 from instrument.foreground.base import ForegroundRemover, Separation
 from instrument.foreground.linear import apply, covariance, leading, principal, projection, seen
+from instrument.foreground.maps import StokesMaps
 from instrument.units import Bool, Float, Real, Whole
 
 SAMPLE = 32768  # coefficients of which medians are taken: to 0.7 %
@@ -38,8 +39,9 @@ class GMCA(ForegroundRemover):
     mode: Literal["project", "threshold"] = "project"
     paper: bool = False
 
-    def separate(self, maps: Any, freq_hz: Float) -> Separation:
+    def separate(self, given: StokesMaps) -> Separation:
         """Foreground A A^+ X, or what of it is significant."""
+        maps = given.plane
         n, f = self.components, len(maps)
         if not 0 < n < f:
             return projection(maps, np.eye(f)[:, :n], Outcome.CONVERGED, f"{n} components of {f} channels: no search")

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from instrument.errors import Outcome
 from instrument.foreground.base import ForegroundRemover, Separation
 from instrument.foreground.linear import covariance, one_thread
+from instrument.foreground.maps import StokesMaps
 from instrument.units import Count, Float
 
 # lengths in Hz of smooth emission, mode mixing and 21-cm signal (after Mertens et al. 2018, MNRAS 478, 3640)
@@ -31,8 +30,9 @@ class GaussianProcess(ForegroundRemover):
 
     iterations: Count = 200
 
-    def separate(self, maps: Any, freq_hz: Float) -> Separation:
+    def separate(self, given: StokesMaps) -> Separation:
         """Posterior mean of the foreground."""
+        maps, freq_hz = given.plane, given.freq_hz
         from scipy.linalg import cho_factor, cho_solve
         from scipy.optimize import minimize
 

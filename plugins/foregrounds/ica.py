@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from instrument.errors import Outcome, PluginError
 from instrument.foreground.base import ForegroundRemover, Separation
 from instrument.foreground.linear import projection, seen
-from instrument.units import Count, Float, Seed, Whole
+from instrument.foreground.maps import StokesMaps
+from instrument.units import Count, Seed, Whole
 
 
 class FastICA(ForegroundRemover):
@@ -26,8 +27,9 @@ class FastICA(ForegroundRemover):
     iterations: Count = 200
     seed: Seed = 0
 
-    def separate(self, maps: Any, freq_hz: Float) -> Separation:
+    def separate(self, given: StokesMaps) -> Separation:
         """Foreground A A^+ (X - mean) + mean; raises `PluginError` where scikit-learn is not installed."""
+        maps = given.plane
         try:
             from sklearn.decomposition import FastICA as Fast
             from sklearn.exceptions import ConvergenceWarning

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 
 from instrument.errors import Outcome
 from instrument.foreground.base import ForegroundRemover, Separation
 from instrument.foreground.linear import principal, projection
-from instrument.units import Float, Whole
+from instrument.foreground.maps import StokesMaps
+from instrument.units import Whole
 
 
 class PCA(ForegroundRemover):
@@ -20,8 +21,9 @@ class PCA(ForegroundRemover):
 
     components: Annotated[int, Whole(at_least=0)] = 4
 
-    def separate(self, maps: Any, freq_hz: Float) -> Separation:
+    def separate(self, given: StokesMaps) -> Separation:
         """Foreground V V^T X."""
+        maps = given.plane
         n = min(self.components, len(maps))
         values, vectors = principal(maps, min(n + 1, len(maps)))
         vectors = vectors[:, :n]

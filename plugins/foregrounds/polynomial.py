@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 
 from instrument.errors import Outcome
 from instrument.foreground.base import ForegroundRemover, Separation
 from instrument.foreground.linear import projection
-from instrument.units import Float, Whole
+from instrument.foreground.maps import StokesMaps
+from instrument.units import Whole
 
 
 class Polynomial(ForegroundRemover):
@@ -21,8 +22,9 @@ class Polynomial(ForegroundRemover):
 
     terms: Annotated[int, Whole(at_least=0)] = 4
 
-    def separate(self, maps: Any, freq_hz: Float) -> Separation:
+    def separate(self, given: StokesMaps) -> Separation:
         """Foreground Q Q^T X."""
+        maps, freq_hz = given.plane, given.freq_hz
         n, x = min(self.terms, len(freq_hz)), np.log(freq_hz)
         span = np.ptp(x)
         x = (2 * x - x.min() - x.max()) / span if span > 0 else np.zeros(len(x))

@@ -17,7 +17,8 @@ import instrument
 from instrument import Analyzer, InputError, Outcome, StokesCube, signal_loss
 from instrument.analyze.power.signal import Signal21cm
 from instrument.foreground.linear import covariance
-from instrument.foreground.score import noise_power
+from instrument.foreground.maps import StokesMaps
+from instrument.foreground.noise import noise_power
 from instrument.image.mocks import FINE, leaked, noise_cube, polarized_screens
 
 SCREENS = FINE.with_fields(width=0.5, floor=0.05, slope=3.5, uv_range=(10.0, 800.0))
@@ -238,6 +239,10 @@ def test_components_are_ordered_by_power_and_of_positive_sum():
     np.testing.assert_allclose((s.mixing**2).sum(axis=0), 1, rtol=1e-12)
 
 
+def given(maps, freq_hz):
+    return StokesMaps("I", {"I": maps}, freq_hz, 1e-4, "K")
+
+
 def test_sums_in_double_precision_keep_components_of_a_millionth():
     # four orthogonal spectra of 1, 1e-2, 1e-4, 1e-6 in float32 data: the covariance holds 1e-12 of its largest
     rng = np.random.default_rng(3)
@@ -249,7 +254,7 @@ def test_sums_in_double_precision_keep_components_of_a_millionth():
     x = np.zeros((40, 64, 64), np.float32)
     for k in range(4):
         x += (strength[k] * spectra[:, k, None, None] * maps[k] * (where == k)).astype(np.float32)
-    found = load("pca").separate(x, np.linspace(1e8, 1.4e8, 40))
+    found = load("pca").separate(given(x, np.linspace(1e8, 1.4e8, 40)))
     captured = ((found.operator @ spectra) ** 2).sum(axis=0)
     np.testing.assert_allclose(captured, 1, atol=1e-6)
     assert covariance(x).dtype == np.float64
@@ -259,7 +264,7 @@ def test_the_log_polynomial_takes_power_laws_and_leaves_negative_pixels_right():
     freq = np.linspace(134e6, 166e6, 161)
     sky = np.random.default_rng(0).standard_normal((24, 24))
     maps = np.multiply.outer((freq / 150e6) ** -2.55, sky)
-    left = maps - load("polynomial", terms=6).separate(maps, freq).of(maps)
+    left = maps - load("polynomial", terms=6).separate(given(maps, freq)).of(maps)
     assert np.abs(left).max() < 1e-7 * np.abs(maps).max()  # sixth order of 2.55 x 0.107: 6e-9
 
 
@@ -268,7 +273,7 @@ def test_the_faraday_filter_takes_what_rotates_slowly_and_leaves_what_rotates_fa
     l2 = (2.998e8 / freq) ** 2
     for depth, low, high in ((0.0, 0, 1e-4), (2.9, 0, 1e-3), (20.0, 0.9, 1.0)):
         maps = np.cos(2 * depth * l2 + 0.3)[:, None, None] * np.ones((1, 3, 3)) * np.arange(1, 10).reshape(3, 3)
-        left = maps - load("faraday-filter").separate(maps, freq).of(maps)
+        left = maps - load("faraday-filter").separate(given(maps, freq)).of(maps)
         assert low <= (left**2).sum() / (maps**2).sum() <= high
 
 

@@ -566,15 +566,15 @@ BROKEN_ENGINES = [
 class FineRemover(ForegroundRemover):
     """The remover that the broken ones below deviate from: four Legendre polynomials of frequency."""
 
-    def separate(self, maps, freq_hz):
-        x = (freq_hz - 147.8e6) / 7.8e6
+    def separate(self, given):
+        x = (given.freq_hz - 147.8e6) / 7.8e6
         basis = np.polynomial.legendre.legvander(x, 3)
-        return projection(maps, basis, Outcome.CONVERGED, "four polynomials", adapted=False)
+        return projection(given.plane, basis, Outcome.CONVERGED, "four polynomials", adapted=False)
 
 
 class OwnWords(FineRemover):
-    def separate(self, maps, freq_hz):
-        return replace(super().separate(maps, freq_hz), outcome="fine")
+    def separate(self, given):
+        return replace(super().separate(given), outcome="fine")
 
 
 class TouchesOthers(FineRemover):
@@ -583,8 +583,8 @@ class TouchesOthers(FineRemover):
 
 
 class AddsForeground(FineRemover):
-    def separate(self, maps, freq_hz):
-        found = super().separate(maps, freq_hz)
+    def separate(self, given):
+        found = super().separate(given)
         return replace(found, mixing=-found.mixing, operator=-found.operator, basis=None)
 
 
@@ -594,14 +594,14 @@ class FillsHoles(FineRemover):
 
 
 class KnowsKelvin(FineRemover):
-    def separate(self, maps, freq_hz):
-        found = super().separate(maps, freq_hz)
-        return replace(found, foreground=np.tanh(found.of(maps)), operator=None)
+    def separate(self, given):
+        found = super().separate(given)
+        return replace(found, foreground=np.tanh(found.of(given.plane)), operator=None)
 
 
 class CountsChannels(FineRemover):
-    def separate(self, maps, freq_hz):
-        return super().separate(maps, np.linspace(140e6, 155.6e6, len(maps)))
+    def separate(self, given):
+        return super().separate(replace(given, freq_hz=np.linspace(140e6, 155.6e6, len(given))))
 
 
 class FillsZeros(FineRemover):
@@ -610,10 +610,11 @@ class FillsZeros(FineRemover):
 
 
 class WorksInPlace(FineRemover):
-    def separate(self, maps, freq_hz):
+    def separate(self, given):
+        maps = given.plane
         maps.setflags(write=True)
         maps *= 1.001
-        return super().separate(maps, freq_hz)
+        return super().separate(given)
 
 
 class ForgetsFields(FineRemover):

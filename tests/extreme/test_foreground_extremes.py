@@ -7,7 +7,7 @@ import pytest
 from astropy import units as u
 
 import instrument
-from instrument import InputError, InstrumentWarning, Outcome, StokesCube
+from instrument import InputError, InstrumentWarning, Outcome, StokesCube, StokesMaps
 
 FREQ = np.linspace(134e6, 166e6, 41)
 NAMES = ("gmca", "pca", "polynomial", "faraday-filter", "gpr")
@@ -248,7 +248,7 @@ def test_fewer_pixels_than_channels_are_all_foreground_to_four_components_of_the
 
 def test_the_polynomial_is_as_good_with_ten_terms_as_with_one():
     # powers of nu in Hz have a condition of 1e28 for four terms; the operator of an orthonormal basis is a projection
-    operator = load("polynomial", terms=10).separate(smooth(1), FREQ).operator
+    operator = load("polynomial", terms=10).separate(StokesMaps("I", {"I": smooth(1)}, FREQ, 1e-4, "K")).operator
     np.testing.assert_allclose(operator @ operator, operator, atol=1e-12)
     assert np.trace(operator) == pytest.approx(10, abs=1e-10)
 
@@ -311,7 +311,8 @@ def test_a_remover_that_makes_nan_is_caught():
     from instrument import ForegroundRemover, Separation
 
     class Bad(ForegroundRemover):
-        def separate(self, maps, freq_hz):
+        def separate(self, given):
+            maps = given.plane
             none = np.zeros((0, *maps.shape[1:]))
             return Separation(Outcome.CONVERGED, "bad", np.zeros((len(maps), 0)), none, foreground=maps * np.nan)
 

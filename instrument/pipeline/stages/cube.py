@@ -149,8 +149,10 @@ class CubeAnalysis(Component):
             raise InputError(f"remove = '{self.remove}': one channel has no foreground that is smooth along frequency")
         if not there:
             raise InputError("the cube has no data: every voxel is NaN or zero")
-        if self.remove is not None and (remover := self.foreground_remover()) and remover.stokes not in there:
-            raise InputError(f"remove = '{self.remove}': Stokes {remover.stokes} of the cube has no data")
+        remover = self.foreground_remover()
+        for plane in () if remover is None else (remover.stokes, *remover.planes):
+            if plane not in there:
+                raise InputError(f"remove = '{self.remove}': Stokes {plane} of the cube has no data")
         asked = [f"'{name}': {out[name]}" for name in self.products or () if name in out]
         if asked:
             raise InputError(f"products = {'; '.join(asked)}")
