@@ -16,9 +16,11 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-from leakage_cubes import CASES, leakage, observed, removers
+from astropy import units as u
+from leakage_cubes import CASES, SCREENS, leakage, load, observed, removers
 
 from instrument import Analyzer
+from instrument.image.mocks import polarized_screens
 
 HERE = Path(__file__).parent
 
@@ -30,8 +32,6 @@ def clock(call):
 
 def bands(split):
     """Power left over power before: k_par below 0.06 (delay 0 included, and not), and above 0.1 /Mpc."""
-    from astropy import units as u
-
     ratios = []
     for first in (0.0, 0.005):
         edges = [first, 0.06, 0.1, 0.92] / u.Mpc
@@ -103,10 +103,43 @@ Power left over power before at k_par < 0.06 /Mpc, the same without delay 0, and
 |---|---|---|---|---|
 {times}
 """
+    text += through_lofar(given.pixels // 2)
     if given.gmca4im:
         text += beside(given, truth)
     (HERE / "foregrounds.md").write_text(text)
     print(text)
+
+
+def through_lofar(pixels):
+    """The score on what the beam of two stations of LOFAR makes of screens, pixels of 1'."""
+    import instrument
+    from instrument.image.beam_leakage import leaked_through
+
+    cube = polarized_screens(
+        pixels=pixels, pixel=1 * u.arcmin, screens=SCREENS, seed=196, centre="08h13m36.0s +48d13m03s"
+    )
+    lofar = instrument.load("telescopes", "lofar-hba", stations=["CS001HBA0", "CS103HBA1"])
+    truth = leaked_through(cube, lofar, ["2012-12-07T02:00:00"])
+    templates = {f"stokes-templates, order={k}": load("stokes-templates", order=k) for k in (2, 4, 6)}
+    rows = []
+    for name, remover in {**removers(), **templates}.items():
+        cells = []
+        for case in CASES:
+            score = remover.split(observed(truth, case, seed=1)).score(foreground=truth)
+            cells.append(f"{score.value:.2g}")
+            print(f"LOFAR {name:25s} {case:17s} {score.value:.3g}", flush=True)
+        rows.append(f"| {name} | " + " | ".join(cells) + " |")
+    rms = f"{1e3 * truth.data[:, 0].std():.1f}"
+    return f"""
+## The same through the beam of LOFAR
+
+Screens as above through the differential beam of CS001HBA0 and CS103HBA1 at 2012-12-07 02:00: {rms} mK rms in Stokes I,
+{pixels} x {pixels} pixels of 1'. Score against the truth.
+
+| remover | {" | ".join(CASES)} |
+|---|{"---|" * len(CASES)}
+{chr(10).join(rows)}
+"""
 
 
 def beside(given, truth):

@@ -3,6 +3,7 @@
 import numpy as np
 from astropy import units as u
 
+import instrument
 from instrument.image.mocks import FINE, leaked, noise_cube, polarized_screens
 
 # 27 screens of which that at 1.2 rad/m^2 stands out; steep, so that 7.1 mK are mostly on scales beyond a degree
@@ -17,29 +18,29 @@ CASES = {
 
 
 def leakage(pixels, seed):
-    """Stokes I of leaked screens, 7.1 mK rms, 161 channels from 134 to 166 MHz, pixels of 0.5'; Q = U = V = 0."""
+    """Screens and what leaks of them into I, 7.1 mK rms; 161 channels from 134 to 166 MHz, pixels of 0.5'; V = 0."""
     cube = leaked(polarized_screens(pixels=pixels, pixel=0.5 * u.arcmin, screens=SCREENS, seed=seed))
-    data = np.zeros_like(cube.data)
-    data[:, 0] = cube.data[:, 0] * np.float32(RMS / cube.data[:, 0].std())
+    data = np.array(cube.data)
+    data[:, 0] *= np.float32(RMS / cube.data[:, 0].std())
     return cube.with_data(data)
 
 
 def observed(truth, case, seed):
-    """The leakage with the noise of a case, in Stokes I."""
+    """The screens and their leakage with the noise of a case, of its own in every Stokes parameter."""
     noise, shaped = CASES[case]
     data = noise_cube(truth, noise * u.K, shaped, seed).data
-    data[:, 0] += truth.data[:, 0]
+    data += truth.data
     return truth.with_data(data)
+
+
+def load(name, **settings):
+    """A remover."""
+    return instrument.load("foregrounds", name, **settings)
 
 
 def removers():
     """Name on the page -> remover; independent components only where scikit-learn is installed."""
     from importlib.util import find_spec
-
-    import instrument
-
-    def load(name, **settings):
-        return instrument.load("foregrounds", name, **settings)
 
     found = {
         "gmca": load("gmca"),
@@ -49,5 +50,6 @@ def removers():
         "polynomial": load("polynomial"),
         "faraday-filter": load("faraday-filter"),
         "gpr": load("gpr"),
+        "stokes-templates": load("stokes-templates"),
     }
     return found | ({"ica": load("ica")} if find_spec("sklearn") else {})
