@@ -20,7 +20,9 @@ from instrument.units import Complex, Direction, Float, Radians
 from instrument.visibilities import Visibilities, VisibilitySet
 from instrument.visibility_sets import as_set
 
-HELD = 1_000_000  # visibilities gridded at once: bounds memory (90 MB) and keeps the fixed cost of a call small
+HELD = 400_000  # visibilities of a channel gridded at once: more makes a call of 512 pixels 6 % cheaper at most
+ALL_HELD = 5 * HELD  # visibilities that wait in all channels together: bounds memory (192 MB)
+WAITING = 96  # bytes of a visibility that waits: u, v, w, weight, I, Q, U, V
 
 
 @checked
@@ -125,6 +127,7 @@ class Images:
         self.density = density
         self.channels: dict[float, _Channel] = {}
         self.centre: Any = None
+        self.waiting = 0  # visibilities, in all channels
 
     def add(self, block: Visibilities) -> None:
         """Add a block."""
@@ -143,8 +146,11 @@ class Images:
             stokes = block.stokes() if stokes is None else stokes
             channel.waiting.append((uvw, weight, stokes[:, f][use]))
             channel.count += len(weight)
+            self.waiting += len(weight)
             if channel.count >= HELD:
                 self._grid(channel)
+        while self.waiting > ALL_HELD:
+            self._grid(max(self.channels.values(), key=lambda c: c.count))
 
     def _grid(self, channel: _Channel) -> None:
         """Sum_k w_k V_k exp(+2 pi i (u l + v m + w (n-1))), real part, for I, Q, U, V and for V = 1."""
@@ -175,28 +181,32 @@ class Images:
                 nthreads=0,
             ).T
         channel.weight += float(weight.sum())
+        self.waiting -= channel.count
         channel.waiting, channel.count = [], 0
 
     def finish(self) -> StokesCube:
         """The cube in Jy/beam; a channel without any visibility is NaN; raises when no channel has one."""
         from astropy import units as u
 
-        planes, psfs = [], []
         freqs = sorted(self.channels)
-        for freq in freqs:
+        if not freqs:
+            raise RefusedError("no block of visibilities was given: nothing to image")
+        pixels = self.imager.pixels
+        planes, psfs = np.empty((len(freqs), 4, pixels, pixels)), np.empty((len(freqs), pixels, pixels))
+        for f, freq in enumerate(freqs):
             channel = self.channels[freq]
             self._grid(channel)
             with np.errstate(divide="ignore", invalid="ignore"):
-                images = channel.sums / channel.weight
-            planes.append(images[:4])
-            psfs.append(images[4])
+                np.divide(channel.sums[:4], channel.weight, out=planes[f])
+                np.divide(channel.sums[4], channel.weight, out=psfs[f])
+            channel.sums = channel.sums[:0]  # a sum and its image at once: twice the cube for one channel only
         if not any(self.channels[f].weight for f in freqs):
             raise RefusedError(f"no visibility lies within uv_range = {self.imager.uv_range} with a weight above 0")
         return StokesCube(
-            data=np.stack(planes),
+            data=planes,
             frequencies=np.array(freqs) * u.Hz,
             pixel=self.imager.pixel * u.rad,
             unit="Jy/beam",
             centre=self.centre,
-            psf=fit_psf(np.stack(psfs), self.imager.pixel),
+            psf=fit_psf(psfs, self.imager.pixel),
         )
