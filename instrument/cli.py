@@ -220,9 +220,10 @@ def _analyze(given: argparse.Namespace) -> int:
 
 
 def _plan(given: argparse.Namespace) -> int:
+    from instrument.pipeline.planning import plan_run
+
     _, scene_file = _scene_file(given)
-    plan = scene_file.plan(scene_file.scene(), given.memory, given.workers)
-    show(str(plan))
+    show(str(plan_run(scene_file, scene_file.scene(), given.memory, given.workers)))
     return DONE
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from instrument.check import BY_STATIONS, DEFINITION, SHARE, Check, Checker, not_checked, watch
 from instrument.checked import checked
 from instrument.errors import InputError, RefusedError
+from instrument.machine import speed
 from instrument.predict.base import Predictor, Prepared, Problem, Work
 from instrument.predict.direct import Direct
 from instrument.predict.threads import alone, look_again
@@ -55,7 +56,7 @@ class Plan(VisibilitySet):
     tolerance: float
     bounds: tuple[Item, ...]
     scale_jy: float
-    seconds: float = field(compare=False, default=0.0)
+    seconds: float = field(compare=False, default=0.0)  # on a machine of speed 1
     checker: Checker | None = field(compare=False, repr=False, default=None)  # sees the blocks as they pass
 
     @property
@@ -107,7 +108,7 @@ class Plan(VisibilitySet):
         ]
         lines.append(
             f"engine        {self.engine_name:<22} {si_prefix(self.work.flops, 'Flop')}, "
-            f"about {_seconds(self.seconds)}, peak {si_prefix(self.memory, 'B')} "
+            f"about {spell(self.seconds / speed())}, peak {si_prefix(self.memory, 'B')} "
             f"in {count_of(len(self.slices), 'block')}"
         )
         lines += [f"refused       {i.name:<22} {i.reason}" for i in self.refused]
@@ -243,7 +244,8 @@ def count_of(n: int, what: str) -> str:
     return f"{n} {what}" if n == 1 else f"{n} {what}s"
 
 
-def _seconds(value: float) -> str:
+def spell(value: float) -> str:
+    """Seconds as one reads them."""
     if value < 1:
         return "1 s"
     return f"{value:.0f} s" if value < 120 else f"{value / 60:.0f} min"

@@ -73,7 +73,7 @@ def make_plan(
     problem = _within(problem, uv_range, left_out)
     kept.append(_w_term(problem))
     ready, label, refused = _choose(problem, engine, budget)
-    limit = _limit(memory)
+    limit = memory_limit(memory)
     shape, work, peak = _blocks(ready, workers, limit)
     rounded = Item(_rounding_name(problem), "", rounding(problem, scale_jy))
     unmodelled = not_modelled(problem, scale_jy)
@@ -291,7 +291,8 @@ def _choose(problem: Problem, name: str | None, budget: Budget) -> tuple[Prepare
     raise RefusedError(f"no engine serves this scene ({reasons})")
 
 
-def _limit(memory: Any) -> float:
+def memory_limit(memory: Any) -> float:
+    """Bytes that may be taken: a size such as "8 GB", or three quarters of the machine."""
     if memory is None:
         return usable()
     found = to_si(memory, "byte", "memory", above=0)

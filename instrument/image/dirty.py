@@ -199,7 +199,7 @@ class Images:
             with np.errstate(divide="ignore", invalid="ignore"):
                 np.divide(channel.sums[:4], channel.weight, out=planes[f])
                 np.divide(channel.sums[4], channel.weight, out=psfs[f])
-            channel.sums = channel.sums[:0]  # a sum and its image at once: twice the cube for one channel only
+            channel.sums = np.zeros((5, 0, 0))  # a sum and its image at once: twice the cube for one channel only
         if not any(self.channels[f].weight for f in freqs):
             raise RefusedError(f"no visibility lies within uv_range = {self.imager.uv_range} with a weight above 0")
         return StokesCube(

@@ -20,7 +20,7 @@ from instrument.image.channels import channel_numbers, in_band
 from instrument.image.cube import Psf, StokesCube
 from instrument.pipeline.folder import RunFolder
 from instrument.pipeline.progress import progress_bar
-from instrument.pipeline.record import json_text, versions
+from instrument.pipeline.record import costs, json_text, spent, versions
 from instrument.pipeline.stages.cube import CubeAnalysis
 from instrument.pipeline.stages.cube_results import CubeResults
 from instrument.provenance import provenance
@@ -127,8 +127,7 @@ def analyze_files(
             with result.timed("write"), provenance(object=Path(paths[0]).name):
                 _write(result, paths, command, folder.partial, ledger)
             path = folder.finish()
-    spent = ", ".join(f"{name} {seconds:.1f}" for name, seconds in sorted(result.seconds.items(), key=lambda s: -s[1]))
-    lines = [*result.lines(), f"time          {sum(result.seconds.values()):.1f} s ({spent})"]
+    lines = [*result.lines(), *spent(result.seconds)]
     show("\n".join([*lines, f"written       {path}/report.html, run.json, tables and figures"]))
     return result
 
@@ -178,7 +177,7 @@ def _write(result: CubeResults, paths: Sequence[str], command: str, folder: Path
         "versions": versions(),
         "machine": {"system": platform.platform()},
         "unused": ledger,
-        "seconds": {k: round(v, 3) for k, v in result.seconds.items()},
+        **costs(result.seconds, {}),
         **result.figures(),
     }
     write_page(page_of_run(record, result.cards(), sections=result.sections(drawer(folder))), folder / "report.html")

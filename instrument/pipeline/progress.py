@@ -6,12 +6,14 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+Progress = Callable[..., None]  # of the fraction done, and the name of what is at work
+
 
 @contextmanager
-def progress_bar(text: str) -> Iterator[Callable[[float], None]]:
-    """Gives a function to call with the fraction done."""
+def progress_bar(text: str) -> Iterator[Progress]:
+    """Gives a function to call with the fraction done, and the name of what is at work."""
     if not sys.stderr.isatty():
-        yield lambda done: None
+        yield lambda done, name="": None
         return
     from rich.console import Console
     from rich.progress import (
@@ -32,4 +34,4 @@ def progress_bar(text: str) -> Iterator[Callable[[float], None]]:
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(text, total=1.0)
-        yield lambda done: bar.update(task, completed=done)
+        yield lambda done, name="": bar.update(task, completed=done, description=f"{text}: {name}" if name else text)

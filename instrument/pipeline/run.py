@@ -10,17 +10,17 @@ from typing import Any
 
 from instrument.errors import unused_ledger
 from instrument.jones.chain import Chain
+from instrument.memory import give_back
 from instrument.pipeline.folder import RunFolder
-from instrument.pipeline.progress import progress_bar
+from instrument.pipeline.planning import plan_run
+from instrument.pipeline.progress import Progress, progress_bar
 from instrument.pipeline.record import Result, json_text, record, summary
 from instrument.pipeline.scene_file import SceneFile
 from instrument.pipeline.scene_text import to_toml
 from instrument.pipeline.stage import EachBlock, Running, StageRun
+from instrument.pipeline.work import PREDICT, RECEIVERS, VERIFY, WRITE
 from instrument.provenance import provenance
 from instrument.visibilities import Visibilities
-
-PREDICT = "predict"
-RECEIVERS = "receivers"  # their errors are put into perfect blocks, where a stage compares with a perfect instrument
 
 
 def run(
@@ -42,13 +42,14 @@ def run(
     with unused_ledger() as ledger:
         result = _planned(scene_file, folder.path, memory, workers, verify)
         result.unused = ledger
-        show(str(result.plan))
-        with folder:
-            _compute(result)
+        show(str(result.whole))
+        with folder, progress_bar(scene_file.name) as progress:
+            _compute(result, progress)
             if verify:
                 result.check = result.plan.check
                 _book(result)
-            with result.timed("write"), provenance(**_known(result)):
+            progress(1 - result.whole.share(WRITE) if result.whole else 1.0, WRITE)
+            with result.timed(WRITE), provenance(**_known(result)):
                 _write(result, tables, folder.partial)
             result.folder = folder.finish()
     show(summary(result))
@@ -59,10 +60,11 @@ def _planned(scene_file: SceneFile, path: Path, memory: str | None, workers: int
     """What will be filled: the scene and its plan."""
     begin = time.perf_counter()
     scene = scene_file.scene()
-    plan = scene_file.plan(scene, memory, workers)
+    whole = plan_run(scene_file, scene, memory, workers)
+    plan = whole.plan
     if verify:  # the blocks as the stages get them, before any corruption
         plan = plan.watched(samples=64, seed=scene_file.seed)
-    return Result(scene_file, scene.instrument, plan, path, seconds={"plan": time.perf_counter() - begin})
+    return Result(scene_file, scene.instrument, plan, path, whole, seconds={"plan": time.perf_counter() - begin})
 
 
 def _known(result: Result) -> dict[str, str | int]:
@@ -78,25 +80,30 @@ def _book(result: Result) -> None:
     """Give the check the seconds that it took of the stage whose blocks it saw."""
     spent = result.plan.checker.spent if result.plan.checker else 0.0
     result.seconds[result.scene.alone or PREDICT] -= spent
-    result.seconds["verify"] = spent
+    result.seconds[VERIFY] = spent
 
 
-def _compute(result: Result) -> None:
+def _compute(result: Result, progress: Progress) -> None:
     """Stream the blocks through the stages that the scene has."""
     stages = result.scene.running
     run = Running(result.scene.name, result.scene.seed, result.instrument, result.plan, stages, parts=result.parts)
-    named = ", ".join([PREDICT, *stages] if result.scene.alone is None else stages)
-    with progress_bar(f"{result.scene.name}: {named}") as update:
-        stream(run, result.timed, update)
+    assert result.whole is not None
+    stream(run, result.timed, progress, result.whole.share)
     result.stages = run.results
 
 
 def stream(
     run: Running,
     timed: Callable[[str], AbstractContextManager[None]] = lambda name: nullcontext(),
-    progress: Callable[[float], None] = lambda done: None,
+    progress: Progress = lambda done, name: None,
+    share: Callable[[str | None], float] = lambda name: 0.0 if name else 1.0,
 ) -> None:
-    """Let the blocks of a plan go through stages one by one and fill in their results; `timed` clocks each stage."""
+    """Let the blocks of a plan go through stages one by one and fill in their results; `timed` clocks each stage.
+
+    `progress` is told the fraction done and the step at work; `share` the part of the time that is the blocks'
+    (`None`), or that a stage takes to finish.
+    """
+    passing = share(None)
 
     def at_work(name: str) -> AbstractContextManager[None]:
         run.now = name
@@ -110,7 +117,12 @@ def stream(
         with at_work(name):
             work[name] = stage.start(run)
     alone = next((name for name, stage in run.stages.items() if stage.alone is not None), None)
-    blocks = run.plan.blocks(progress=progress) if alone is None else work[alone].blocks(progress)
+    named = alone or ", ".join([PREDICT, *work])
+
+    def passed(done: float) -> None:
+        progress(passing * done, named)
+
+    blocks = run.plan.blocks(progress=passed) if alone is None else work[alone].blocks(passed)
     end = object()
     while True:
         with at_work(alone or PREDICT):
@@ -123,8 +135,11 @@ def stream(
                 block = one.take(block)
     run.model = None
     for name, one in work.items():
+        progress(passing, name)
         with at_work(name):
+            give_back()  # what the blocks took, up to 300 MB, stays with the threads that are gone
             run.results[name] = one.finish()
+        passing += share(name)
 
 
 def _write(result: Result, tables: dict[str, Any], folder: Path) -> None:

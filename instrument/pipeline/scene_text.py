@@ -45,7 +45,8 @@ def read_tables(scene: str | os.PathLike[str]) -> dict[str, Any]:
     from instrument.files_in import is_measurement_set, read_regular
 
     path = Path(scene)
-    if path.suffix == ".toml" or _is_there(path) or is_measurement_set(path):
+    taken = str(scene) in shipped() and os.path.isdir(path)  # a run of it may have left a folder of its name
+    if path.suffix == ".toml" or (_is_there(path) and not taken) or is_measurement_set(path):
         return _tables(_decoded(read_regular(path, int(MOST_BYTES), "scene file"), str(path)), str(path))
     if str(scene) not in shipped():
         raise InputError(f"no scene is called '{scene}': {did_you_mean(str(scene), shipped())}; or give a .toml file")

@@ -15,6 +15,7 @@ from instrument.errors import InputError
 from instrument.image.dirty import Imager
 from instrument.image.weights import Density
 from instrument.model import Instrument
+from instrument.pipeline.work import Items, StageWork
 from instrument.plan import Plan
 from instrument.report.page import Card, FigureEntry, Section
 from instrument.scene import Scene
@@ -68,6 +69,14 @@ class Stage(Component):
         """Raise `InputError` for a scene in which this stage cannot work; name what it will not use (`unused`)."""
         return None
 
+    def work(self, run: Running) -> StageWork:
+        """What it costs in a run that is planned: seconds and bytes, which go into the plan; nothing unless said."""
+        return StageWork()
+
+    def items(self, run: Running) -> Items:
+        """What it keeps, leaves out and does not model, with bounds, for the plan."""
+        return Items()
+
     @abstractmethod
     def start(self, run: Running) -> StageRun:
         """The stage at work."""
@@ -87,6 +96,17 @@ class Running:
     parts: dict[str, dict[str, float]] = field(default_factory=dict)  # seconds, by stage, of what it names
     now: str = ""  # the stage at work
     _densities: dict[str, dict[float, Density]] = field(default_factory=dict)
+
+    @property
+    def block(self) -> tuple[int, int, int]:
+        """Times, channels and baselines (T, F, B) of a block."""
+        return (*self.plan.block_shape, self.plan.problem.shape[2])
+
+    @property
+    def visibilities(self) -> float:
+        """How many there are in the run."""
+        times, channels, baselines = self.plan.problem.shape
+        return float(times) * channels * baselines
 
     @contextmanager
     def timed(self, part: str) -> Iterator[None]:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from instrument.report.page import Block, Card, Cell, Details, Page, Section, Table, Text, duration, number
+from instrument.units import si_prefix
 
 
 def page_of_run(
@@ -17,7 +18,7 @@ def page_of_run(
     """The page of a run from what `run.json` holds; a part that is absent there is absent here.
 
     `cards`, `sections` and long `tables` are those of the stages. Read are name, title, finished, seed, versions,
-    machine, plan (text, engine), seconds, parts, checks, and where given command, kind ("scene" unless said) and
+    machine, plan (text, engine), stages, memory, parts, checks, and where given command, kind ("scene" unless said) and
     stage_errors (stage -> how wrong it may be).
     """
     plan = record.get("plan", {})
@@ -62,10 +63,11 @@ def _cards(record: Mapping[str, Any]) -> list[Card]:
     if (check := checks.get("prediction")) and check.get("passed") is not None:
         note = f"of the {number(check['relative_to_jy'], 4)} Jy in the sky; bound {check['bound']:.1e}"
         cards.append(Card("Prediction error", f"{check['error']:.1e}", note, "good" if check["passed"] else "bad"))
-    if seconds := record.get("seconds"):
+    if steps := record.get("stages"):
+        seconds = [step["seconds"]["measured"] for step in steps.values()]
         parts = [record.get("plan", {}).get("engine"), record.get("machine", {}).get("workers")]
         note = (f"engine {parts[0]}, {parts[1]} workers; " if all(parts) else "") + "without writing"
-        cards.append(Card("Wall time", duration(sum(seconds.values())), note))
+        cards.append(Card("Wall time", duration(sum(seconds)), note))
     return cards
 
 
@@ -91,25 +93,42 @@ def _checks(record: Mapping[str, Any]) -> list[Block]:
 
 
 def _stages(record: Mapping[str, Any]) -> list[Block]:
-    seconds, checks = record.get("seconds", {}), record.get("checks", {})
-    if not seconds:
+    steps, checks = record.get("stages", {}), record.get("checks", {})
+    if not steps:
         return []
     wrong = dict(record.get("stage_errors", {}))
     if (check := checks.get("prediction")) and check.get("passed") is not None:
         wrong.setdefault("predict", f"{check['error']:.1e} measured, {check['bound']:.1e} at most, of the total flux")
     if check := checks.get("photometry"):
         wrong.setdefault("photometry", "; ".join(dict.fromkeys(check["outcome"])))
-    longest, parts = max(seconds.values()) or 1.0, record.get("parts", {})
+    took = {name: step["seconds"]["measured"] for name, step in steps.items()}
+    longest, parts = max(took.values()) or 1.0, record.get("parts", {})
     rows: list[list[Any]] = []
-    for stage, spent in sorted(seconds.items(), key=lambda item: -item[1]):
-        inside = parts.get(stage, {})
-        own = wrong.get(stage) or ("" if any(wrong.get(part) for part in inside) else "–")
-        rows.append([stage, Cell(duration(spent), bar=spent / longest), own])
-        rows += [
-            [f"\u2003{part}".replace(" ", "\u00a0"), Cell(duration(took), bar=took / longest), wrong.get(part, "")]
-            for part, took in sorted(inside.items(), key=lambda item: -item[1])
-        ]
-    return [Table(["stage", "time", "how wrong it may be"], rows)]
+    for name, spent in sorted(took.items(), key=lambda item: -item[1]):
+        inside = parts.get(name, {})
+        own = wrong.get(name) or ("" if any(wrong.get(part) for part in inside) else "–")
+        due, memory = steps[name]["seconds"]["planned"], steps[name]["memory"]
+        bar = Cell(duration(spent), bar=spent / longest)
+        planned = "–" if due is None else duration(due)
+        rows.append([name, bar, planned, _bytes(memory["measured_bytes"]), _bytes(memory["planned_bytes"]), own])
+        for part, t in sorted(inside.items(), key=lambda item: -item[1]):
+            label = f"\u2003{part}".replace(" ", "\u00a0")
+            rows.append([label, Cell(duration(t), bar=t / longest), "", "", "", wrong.get(part, "")])
+    heads = ["stage", "time", "planned", "memory", "planned", "how wrong it may be"]
+    blocks: list[Block] = [Table(heads, rows)]
+    if (memory := record.get("memory")) and memory["planned_bytes"]:
+        blocks.append(
+            Text(
+                f"Memory of a stage: by how much it raised the most that the process has had. In the whole "
+                f"{_bytes(memory['measured_bytes'])} at most, {_bytes(memory['planned_bytes'])} planned, the "
+                "interpreter's own among them."
+            )
+        )
+    return blocks
+
+
+def _bytes(value: float | None) -> str:
+    return "–" if not value else si_prefix(value, "B")
 
 
 def _again(record: Mapping[str, Any]) -> list[Block]:

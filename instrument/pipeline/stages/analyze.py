@@ -13,9 +13,12 @@ from instrument.analyze.power.spectra import Spectrum2D
 from instrument.analyze.sources.photometry import ForcedPhotometry
 from instrument.errors import InputError, unused
 from instrument.pipeline.stage import Beside, Draw, Running, Several, Stage, StageResult, StageRun
+from instrument.pipeline.stages.analyze_work import cube_products, photometry, together
 from instrument.pipeline.stages.cube import CubeAnalysis
-from instrument.pipeline.stages.image import ImageResult
-from instrument.pipeline.stages.leakage import LeakageRun
+from instrument.pipeline.stages.image import Image, ImageResult
+from instrument.pipeline.stages.leakage import EXPECTED_JONES, LeakageRun
+from instrument.pipeline.work import Items, StageWork
+from instrument.plan import Item
 from instrument.report.page import Figures, Section
 from instrument.scene import Scene
 from instrument.units import Count, UvRange
@@ -59,6 +62,32 @@ class Analyze(Stage):
         if asked and freq.size < 2:
             raise InputError(f"[analyze.cube] products = '{asked[0]}': one channel; give more, or take 'spectrum-2d'")
 
+    def work(self, run: Running) -> StageWork:
+        """That of its products, one after the other."""
+        parts = []
+        if "leakage" in self.products:
+            parts.append(photometry(self._photometry, run, EXPECTED_JONES))
+        if (image := run.stage("image", Image)) is not None:
+            pixels, channels = image.imager.pixels**2, run.plan.problem.shape[1]
+            if "spectrum-2d" in self.products:
+                parts.append(
+                    StageWork("2D spectra", finish_seconds=2e-6 * pixels, finish_bytes=200.0 * pixels, figures=1)
+                )
+            if self.cube is not None:
+                parts.append(cube_products(self.cube, channels, pixels))
+        return together(parts)
+
+    def items(self, run: Running) -> Items:
+        """Integrations that fluxes are not measured in."""
+        if self.every == 1 or "leakage" not in self.products:
+            return Items()
+        text = f"fluxes are the mean over each {self.every}th: right for a sky that does not change"
+        return Items(left_out=(Item("integrations", text),))
+
+    @property
+    def _photometry(self) -> ForcedPhotometry:
+        return ForcedPhotometry(uv_range=self.uv_range, every=self.every)
+
     def start(self, run: Running) -> StageRun:
         """The stage at work."""
         return _AnalyzeRun(self, run)
@@ -67,8 +96,7 @@ class Analyze(Stage):
 class _AnalyzeRun(StageRun):
     def __init__(self, settings: Analyze, run: Running) -> None:
         self.settings, self.run = settings, run
-        photometry = ForcedPhotometry(uv_range=settings.uv_range, every=settings.every)
-        self.leakage = LeakageRun(run, photometry) if "leakage" in settings.products else None
+        self.leakage = LeakageRun(run, settings._photometry) if "leakage" in settings.products else None
 
     def take(self, block: Visibilities) -> Visibilities:
         """Measure the sources in a block."""

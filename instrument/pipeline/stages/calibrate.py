@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 
 from instrument.analyze.analyzer import Analyzer
+from instrument.calibrate.als import LANES
 from instrument.calibrate.base import Calibrator, Solution
 from instrument.calibrate.di_errors import DIComparison, DISums
 from instrument.calibrate.selfcal import SelfCal
@@ -21,7 +22,8 @@ from instrument.image.dirty import Images
 from instrument.jones.chain import Chain
 from instrument.numbers import brief
 from instrument.pipeline.stage import Beside, Draw, Running, Stage, StageResult, StageRun
-from instrument.pipeline.stages.image import Image
+from instrument.pipeline.stages.image import Image, imaging
+from instrument.pipeline.work import StageWork
 from instrument.registry import load, names
 from instrument.report.page import Block, Card, Figures, Section, Table, Text, number
 from instrument.units import Float
@@ -29,6 +31,22 @@ from instrument.visibilities import Visibilities
 from instrument.whole_file import write_ecsv
 
 IMAGES = ("corrupted", "corrected", "corrupted - corrected", "corrected - model")
+
+SOLVE = 0.12e-6  # seconds of a visibility for each decade of tolerance
+KEPT = 300.0  # bytes of a station and interval: solutions, and what the comparison with the truth makes of them
+SOLVING = 600.0  # bytes of a baseline in each vector lane
+
+
+def solving(tolerance: float, run: Running) -> StageWork:
+    """What solving all intervals down to a tolerance, and comparing with the truth, costs."""
+    times, channels, baselines = run.plan.problem.shape
+    stations = run.plan.problem.at.shape[2]
+    return StageWork(
+        f"solves of {stations} stations",
+        seconds=SOLVE * run.visibilities * max(1.0, -np.log10(tolerance)),
+        held_bytes=KEPT * stations * times * channels,
+        block_bytes=6 * 64.0 * float(np.prod(run.block)) + SOLVING * baselines * LANES * run.plan.workers,
+    )
 
 
 class Calibrate(Stage):
@@ -51,6 +69,20 @@ class Calibrate(Stage):
             laboratories = [name.partition(".")[2] for name in names("stages") if name.startswith("calibrate.")]
             raise InputError(f"{said}: {did_you_mean(str(kind), [*names('calibrators'), *laboratories])}")
         return cls(calibrator=load("calibrators", kind, **{k: v for k, v in settings.items() if k != KIND}))
+
+    def work(self, run: Running) -> StageWork:
+        """Solves of all intervals, their comparison with the truth, and four sets of images where there are any."""
+        image = run.stage("image", Image)
+        drawn = StageWork() if image is None else imaging(image.imager, run, len(IMAGES))
+        solved = solving(self.calibrator.tolerance, run)
+        return drawn._replace(
+            does="; ".join(text for text in (solved.does, drawn.does) if text),
+            seconds=drawn.seconds + solved.seconds,
+            held_bytes=drawn.held_bytes + solved.held_bytes,
+            block_bytes=drawn.block_bytes + solved.block_bytes,
+            result_bytes=drawn.result_bytes + solved.held_bytes,
+            figures=4 if drawn.does else 3,
+        )
 
     def start(self, run: Running) -> StageRun:
         """The stage at work."""

@@ -6,6 +6,7 @@ from typing import ClassVar, Literal
 
 from instrument.errors import unused
 from instrument.pipeline.stage import EachBlock, Running, Stage, StageRun
+from instrument.pipeline.work import StageWork, copies
 from instrument.scene import Scene
 
 
@@ -23,6 +24,12 @@ class Correct(Stage):
         """Name the table where there is no beam."""
         if not scene.instrument.chain().beams().parts:
             unused("scene", ["[correct]"], "the instrument has no beam to take out")
+
+    def work(self, run: Running) -> StageWork:
+        """Matrices of the stations on both sides of every visibility."""
+        if not run.instrument.chain().beams().parts:
+            return StageWork("no beam to take out")
+        return copies(run.visibilities, run.block, 3.0, 0.3e-6, "the beam towards the phase centre taken out")
 
     def start(self, run: Running) -> StageRun:
         """The stage at work."""

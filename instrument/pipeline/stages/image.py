@@ -12,12 +12,19 @@ import numpy as np
 from instrument.component import Component
 from instrument.errors import unused
 from instrument.image.cube import StokesCube
-from instrument.image.dirty import Imager, Images
+from instrument.image.dirty import ALL_HELD, HELD, WAITING, Imager, Images
 from instrument.memory import afford
+from instrument.observe.directions import LIGHT
 from instrument.pipeline.stage import Beside, Draw, Running, Stage, StageResult, StageRun
+from instrument.pipeline.work import Items, StageWork
+from instrument.plan import Item, count_of
 from instrument.report.page import Card, Figures, Section, Table, number
 from instrument.scene import Scene
 from instrument.visibilities import Visibilities
+
+# seconds of a visibility on two cores: gridded in one plane; picked out, with its Stokes parameters
+GRIDDING, PICKING = 0.9e-6, 0.3e-6
+GRIDDED = 250.0  # bytes of a visibility while it is gridded
 
 
 class Image(Stage):
@@ -45,6 +52,17 @@ class Image(Stage):
         if self.imager.weighting != "briggs" and "robust" in self.imager.model_fields_set:
             unused("[image]", ["robust"], f"it is of weighting = 'briggs', and this is '{self.imager.weighting}'")
 
+    def work(self, run: Running) -> StageWork:
+        """That of images of all channels."""
+        return imaging(self.imager, run)._replace(figures=2)
+
+    def items(self, run: Running) -> Items:
+        """Baselines outside the uv range of the images, in the share of all."""
+        share = inside(self.imager.uv_range, run)
+        if share == 1:
+            return Items()
+        return Items(left_out=(Item("visibilities", f"{1 - share:.0%} outside uv_range: asked for, no error"),))
+
     def start(self, run: Running) -> StageRun:
         """The stage at work."""
         return _ImageRun(self.imager, self.sums(run))
@@ -52,6 +70,36 @@ class Image(Stage):
     def sums(self, run: Running) -> Images:
         """Empty sums of images, with the weights of this run."""
         return self.imager.start(run.density(self.imager))
+
+
+def imaging(imager: Imager, run: Running, count: int = 1) -> StageWork:
+    """What `count` sets of images of the visibilities of a run cost."""
+    channels, plane = run.plan.problem.shape[1], 8.0 * imager.pixels**2
+    chosen = run.visibilities * inside(imager.uv_range, run)
+    seconds = GRIDDING * 5 * chosen + PICKING * run.visibilities + 2e-7 * 5 * channels * imager.pixels**2
+    together = min(HELD, chosen / channels)
+    return StageWork(
+        f"{count_of(count * channels, 'image')} of {imager.pixels} x {imager.pixels} in I, Q, U, V and the PSF",
+        seconds=count * seconds,
+        held_bytes=count * (5 * channels * plane + WAITING * min(chosen, HELD * channels, ALL_HELD)),
+        block_bytes=GRIDDED * together + 8 * 4 * plane + 128.0 * float(np.prod(run.block)),
+        finish_bytes=GRIDDED * together + 8 * 4 * plane,
+        result_bytes=count * 5 * channels * plane,
+        wrong=f"gridding {imager.accuracy:.0e} of the image rms",
+        remedy="lower image.pixels, or the number of channels",
+    )
+
+
+def inside(uv_range: tuple[float, float] | None, run: Running) -> float:
+    """The share of visibilities within a uv range (wavelengths), from 16 integrations of the middle channel."""
+    if uv_range is None:
+        return 1.0
+    problem = run.plan.problem
+    times, channels, _ = problem.shape
+    at = problem.at.block(slice(None, None, -(-times // 16)), slice(channels // 2, channels // 2 + 1))
+    length = np.linalg.norm((at.uvw_m[:, problem.antenna1] - at.uvw_m[:, problem.antenna2])[..., :2], axis=-1)
+    length = length * float(at.freq_hz[0]) / LIGHT
+    return float(np.mean((length >= uv_range[0]) & (length <= uv_range[1])))
 
 
 class _ImageRun(StageRun):

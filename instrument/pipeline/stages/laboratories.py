@@ -9,15 +9,21 @@ from typing import Any, ClassVar, Self
 
 from instrument.calibrate.directional import DirectionalCal
 from instrument.component import Component
-from instrument.experiments.incomplete_model import IncompleteModel
+from instrument.experiments.incomplete_model import SOLVED_TOGETHER, IncompleteModel
 from instrument.experiments.incomplete_model_result import Sweep
 from instrument.experiments.many_directions import ManyDirections
 from instrument.experiments.many_directions_result import ManyDirectionsResult
 from instrument.image.dirty import Imager
 from instrument.pipeline.stage import Beside, Draw, Running, Stage, StageResult, StageRun
+from instrument.pipeline.stages.calibrate import solving
+from instrument.pipeline.stages.image import imaging
 from instrument.pipeline.stages.noise import STEP, Noise
+from instrument.pipeline.work import StageWork
+from instrument.planner import BLOCK_BYTES
 from instrument.report.page import Card, Details, Figures, Section, Table, Text, number
 from instrument.visibilities import Visibilities
+
+DIRECTIONAL = 2.5e-6  # seconds of a visibility and a pair of directions, solved for all directions at once
 
 
 def _common(beside: Beside) -> dict[str, Any]:
@@ -41,6 +47,22 @@ class IncompleteModelStage(Stage):
         image = {"image": Imager(**beside.tables["image"])} if "image" in beside.tables else {}
         return cls(laboratory=IncompleteModel(**{**image, **_common(beside), **settings}))
 
+    def work(self, run: Running) -> StageWork:
+        """Predictions of all shells and, for every model, a solve and an image of what it left."""
+        lab, count = self.laboratory, len(self.laboratory.models)
+        drawn = StageWork() if lab.image is None else imaging(lab.image, run, count + 1)
+        solved = solving(lab.selfcal.tolerance, run)
+        stations = run.plan.problem.at.shape[2]
+        moved = 3e-9 * lab.watched * stations**2 * run.plan.problem.shape[0] / lab.every
+        block = 64.0 * run.visibilities * min(1.0, SOLVED_TOGETHER * run.plan.workers / run.plan.problem.shape[0])
+        return drawn._replace(
+            does=f"calibration on {count} models; {drawn.does}".rstrip("; "),
+            seconds=drawn.seconds + count * solved.seconds + 1.3 * run.plan.seconds + count * moved,
+            finish_seconds=1.0 + 2e-6 * (0 if lab.image is None else count * lab.image.pixels**2),
+            block_bytes=drawn.block_bytes + solved.block_bytes + run.plan.memory + (count + 8) * block,
+            figures=1 if lab.image is None else 2,
+        )
+
     def start(self, run: Running) -> StageRun:
         """The stage at work."""
         return _Alone(run, lambda progress: SweepResult(self.laboratory.run(run.plan, progress=progress)))
@@ -61,6 +83,16 @@ class ManyDirectionsStage(Stage):
         if solver:
             own["calibrator"] = DirectionalCal(**solver)
         return cls(laboratory=ManyDirections(**{**_common(beside), **own}))
+
+    def work(self, run: Running) -> StageWork:
+        """Predictions, solves in all directions and in one, and what they leave, in blocks of 64 MB of models."""
+        lab, problem = self.laboratory, run.plan.problem
+        solves = DIRECTIONAL * run.visibilities * lab.clusters**2
+        return StageWork(
+            f"solves of {problem.at.shape[2]} stations in {lab.clusters} directions",
+            seconds=solves + solving(lab.calibrator.tolerance, run).seconds + 1.3 * run.plan.seconds,
+            block_bytes=run.plan.memory + 5 * BLOCK_BYTES,
+        )
 
     def start(self, run: Running) -> StageRun:
         """The stage at work."""

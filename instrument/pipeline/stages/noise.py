@@ -9,6 +9,7 @@ from pydantic import Field
 
 from instrument.errors import InputError
 from instrument.pipeline.stage import Beside, EachBlock, Running, Stage, StageRun
+from instrument.pipeline.work import StageWork, copies
 from instrument.units import Jansky, Seed
 
 STEP = 3  # of the seeds of a scene
@@ -30,6 +31,10 @@ class Noise(Stage):
     def ranges(self) -> tuple[tuple[float, float] | None, ...]:
         """None: noise is added to what others ask for."""
         return ()
+
+    def work(self, run: Running) -> StageWork:
+        """Eight random numbers a visibility, and another block."""
+        return copies(run.visibilities, run.block, 3.0, 0.3e-6, f"{self.sefd:g} Jy a station")
 
     def start(self, run: Running) -> StageRun:
         """The stage at work."""
