@@ -35,7 +35,7 @@ def speed() -> float:
     # a place to keep it only saves time
     with contextlib.suppress(OSError, InstrumentError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(path) as partial:
+        with whole_file(path, overwrite=True) as partial:
             partial.write_text(json.dumps({"of": key, "speed": value}), encoding="utf-8")
     return value
 

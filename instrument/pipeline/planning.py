@@ -27,7 +27,7 @@ from instrument.predict.direct import Direct
 from instrument.scene import Scene
 from instrument.units import si_prefix
 
-STEPS = 6  # of shrinking blocks until the run fits
+HALVINGS = 12  # of blocks until the run fits
 LIBRARIES = 60e6  # bytes of compiled loops and of the libraries that stages load at their first block
 PAGE_BYTES, PAGE_SECONDS, FIGURE_SECONDS = 90e6, 1.0, 0.4  # matplotlib and jinja2 loaded; a figure drawn
 
@@ -39,22 +39,14 @@ def plan_run(file: SceneFile, scene: Scene, memory: Any = None, workers: int | N
     """
     limit = memory_limit(memory)
     found = whole(file, scene, file.plan(scene, None, workers))
-    for _ in range(STEPS):
+    for _ in range(HALVINGS):
         if found.memory <= limit:
             return found
-        room = found.plan.memory - (found.memory - limit) / max(1.0, _per_block(found))
         try:
-            if room <= 0:
-                break
-            found = whole(file, scene, file.plan(scene, f"{room:.0f} byte", workers))
+            found = whole(file, scene, file.plan(scene, f"{found.plan.memory / 2:.0f} byte", workers))
         except RefusedError:
             break
     raise RefusedError(_too_much(found, limit, memory))
-
-
-def _per_block(found: RunPlan) -> float:
-    """How many bytes of the whole go with one byte of blocks."""
-    return sum(work.block_bytes for work in found.works.values()) / max(found.plan.memory, 1.0)
 
 
 def _too_much(found: RunPlan, limit: float, memory: Any) -> str:

@@ -14,7 +14,7 @@ from instrument.memory import give_back
 from instrument.pipeline.folder import RunFolder
 from instrument.pipeline.planning import plan_run
 from instrument.pipeline.progress import Progress, progress_bar
-from instrument.pipeline.record import Result, json_text, record, summary
+from instrument.pipeline.record import Result, costs, json_text, record, summary
 from instrument.pipeline.scene_file import SceneFile
 from instrument.pipeline.scene_text import to_toml
 from instrument.pipeline.stage import EachBlock, Running, StageRun
@@ -148,6 +148,7 @@ def _write(result: Result, tables: dict[str, Any], folder: Path) -> None:
     from instrument.report.run_page import page_of_run
     from instrument.report.style import drawer
 
+    begin = time.perf_counter()
     (folder / "scene.toml").write_text(to_toml(tables), encoding="utf-8")
     for stage in result.stages.values():
         stage.write(folder)
@@ -161,4 +162,5 @@ def _write(result: Result, tables: dict[str, Any], folder: Path) -> None:
         tables=[section for stage in made for section in stage.tables()],
     )
     write_page(page, folder / "report.html")
+    what |= costs(result.seconds | {WRITE: time.perf_counter() - begin}, result.grown, result.whole)
     (folder / "run.json").write_text(json_text(what), encoding="utf-8")

@@ -250,7 +250,7 @@ flux = "1 Jy"
     assert found["passed"] is True
     assert found["seen"] == {"times": [6, 6], "channels": [2, 2], "stations": [3, 3], "baselines": [3, 3]}
     assert "all 3 baselines" in found["text"]
-    assert "verify" in json.loads((tmp_path / "out" / "run.json").read_text())["seconds"]
+    assert "verify" in json.loads((tmp_path / "out" / "run.json").read_text())["stages"]
 
 
 def test_f6_any_time_is_looked_at_as_often_as_the_share_that_is_printed(plan):

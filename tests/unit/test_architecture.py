@@ -26,7 +26,7 @@ LAYERS = (
     ("shown",),
     ("whole_file",),
     ("units", "checked"),
-    ("files_in", "memory"),
+    ("files_in", "memory", "machine"),
     ("h5",),
     ("registry", "mat2", "phasor"),
     ("component",),

@@ -221,7 +221,14 @@ RECORD = {
     "versions": {"instrument": "9.8.7", "numpy": "2.0"},
     "machine": {"system": "Linux", "workers": 16},
     "plan": {"text": ["scene mock-grid: <59> stations", "kept  StationBeam"], "engine": "matrix"},
-    "seconds": {"predict": 20.0, "image": 10.0, "write": 0.0},
+    "stages": {
+        name: {
+            "seconds": {"planned": due, "measured": spent},
+            "memory": {"planned_bytes": 2e6, "measured_bytes": 1.5e6},
+        }
+        for name, due, spent in (("predict", 18.0, 20.0), ("image", 12.0, 10.0), ("write", None, 0.0))
+    },
+    "memory": {"planned_bytes": 8e8, "measured_bytes": 7e8},
     "checks": {
         "prediction": {"error": 3e-14, "bound": 2e-12, "samples": 64, "relative_to_jy": 189.6, "passed": True},
         "photometry": {"outcome": ["converged"], "passed": True, "flux_in_jy": 189.6, "flux_out_jy": 116.3},
@@ -296,7 +303,7 @@ def test_a_check_that_fell_short_is_said_at_the_top(tmp_path):
 
 
 def test_parts_that_are_absent_from_the_record_are_absent_from_the_page(tmp_path):
-    made = page_of_run({"name": "bare", "seconds": {"plan": 0.4}})
+    made = page_of_run({"name": "bare", "stages": {"plan": RECORD["stages"]["predict"]}})
     assert [section.title for section in made.sections] == [
         "What each stage cost, and how wrong it may be",
         "To run it again",
