@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from instrument import mat2
 from instrument.errors import InputError
 from instrument.numbers import COUNT, SEED
+from instrument.observe.closure import CLOSURE_M
 from instrument.observe.directions import LIGHT
 from instrument.predict.base import Problem
 from instrument.sky.points import points_of
@@ -268,6 +269,13 @@ def _same_scene(block: Visibilities, full: Problem) -> None:
         )
     if block.layout.names != full.at.layout.names or block.phase_centre != full.at.centre:
         raise InputError("these visibilities are of other stations or another phase centre than the plan")
+    if block.given_uvw_m is not None:
+        apart = float(np.abs(block.given_uvw_m - replace(block, given_uvw_m=None).uvw_m).max(initial=0.0))
+        if apart > CLOSURE_M:
+            raise InputError(
+                f"these visibilities have UVW of their own, up to {apart:.2g} m from those that a plan works out: "
+                "there is nothing to hold them against"
+            )
 
 
 def _indices(known: Float, asked: Float, near: float, what: str, unit: str) -> Int:

@@ -56,28 +56,27 @@ def opened(path: Any, what: str) -> Iterator[Any]:
 
 def members(group: Any) -> dict[str, Any]:
     """Groups and datasets of a group by name; a link raises, for what a file names is not opened."""
+    return {name: _member(group, name) for name in group}
+
+
+def _member(group: Any, name: str) -> Any:
     import h5py
 
-    out = {}
-    for name in group:
-        link = group.get(name, getlink=True)
-        if not isinstance(link, h5py.HardLink):
-            other = (
-                f"in the file '{harmless(link.filename, 80)}'" if isinstance(link, h5py.ExternalLink) else "elsewhere"
-            )
-            raise FileError(
-                f"{file_of(group)}: '{harmless(name, 80)}' only points to something {other}, which is not opened; "
-                "copy it in (h5copy, h5repack)"
-            )
-        out[name] = group[name]
-    return out
+    link = group.get(name, getlink=True)
+    if not isinstance(link, h5py.HardLink):
+        other = f"in the file '{harmless(link.filename, 80)}'" if isinstance(link, h5py.ExternalLink) else "elsewhere"
+        raise FileError(
+            f"{file_of(group)}: '{harmless(name, 80)}' only points to something {other}, which is not opened; "
+            "copy it in (h5copy, h5repack)"
+        )
+    return group[name]
 
 
 def dataset(group: Any, name: str, kinds: str = "fiuSUO") -> Any:
     """A dataset of numbers or text that is all in this file, not yet read; raises `FileError` for anything else."""
     import h5py
 
-    found = members(group).get(name)
+    found = _member(group, name) if name in group else None
     where = f"{file_of(group)}, {harmless(group.name)}"
     if found is None:
         raise FileError(f"{where}: there is no '{name}'")

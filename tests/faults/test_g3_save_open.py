@@ -90,6 +90,34 @@ def test_a_plan_is_saved_block_by_block_and_read_in_parts(plan, tmp_path):
     same(ins.Visibilities.open(tmp_path / "copy.h5"), whole)
 
 
+def test_memory_does_not_grow_with_what_is_saved_or_read(tmp_path, monkeypatch):
+    import tracemalloc
+
+    rng = np.random.default_rng(0)
+    enu = np.c_[rng.uniform(-300, 300, (24, 2)), np.zeros(24)] * u.m
+    layout = ins.Layout.from_enu([f"s{k}" for k in range(24)], enu, 6.9 * u.deg, 52.9 * u.deg, 10 * u.m)
+    observation = ins.Observation(
+        phase_centre=CENTRE, transit="2012-12-07", duration=160 * u.s, interval=1 * u.s, frequencies=[150] * u.MHz
+    )
+    sky = ins.PointSky.at(SkyCoord([123.4], [48.2], unit="deg"), [3.0])
+    made = ins.Scene(instrument=ins.Composed(stations=layout), sky=sky, observation=observation).plan(workers=1)
+    made = replace(made, block_shape=(8, 1))
+    whole = 64 * 160 * len(layout.baselines[0])  # 2.8 MB
+    monkeypatch.setattr("instrument.visibility_sets.BLOCK_BYTES", whole / 20)
+    assert len([*made.blocks()]) == 20  # and what is made once is made: coordinates, compiled code
+    peaks = []
+    for work in (
+        lambda: made.save(tmp_path / "x.h5"),
+        lambda: [*map(repr, ins.VisibilityFile(tmp_path / "x.h5").blocks())],
+    ):
+        tracemalloc.start()
+        work()
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert (tmp_path / "x.h5").stat().st_size > whole
+    assert max(peaks) < whole / 3, [peak / whole for peak in peaks]
+
+
 def test_a_file_is_read_in_blocks_of_bounded_size(plan, tmp_path, monkeypatch):
     plan.save(tmp_path / "x.h5")
     monkeypatch.setattr("instrument.visibility_sets.BLOCK_BYTES", 64 * 3 * 2)  # three baselines, two channels

@@ -76,6 +76,12 @@ def test_given_uvw_that_do_not_close_are_refused_where_stations_are_needed(turne
         ForcedPhotometry().measure(replace(turned, given_uvw_m=uvw), SKY)
 
 
+def test_data_with_uvw_of_their_own_are_not_held_against_a_plan(plan, vis, turned):
+    with pytest.raises(InputError, match=r"have UVW of their own, up to .* m from those that a plan works out"):
+        plan.verify(turned)
+    assert plan.verify(replace(vis, given_uvw_m=vis.uvw_m)).passed
+
+
 def test_given_uvw_stay_through_everything_and_are_compared(vis, turned):
     gains = ins.GainTerm(rms=0.1, seed=1)
     for one in (

@@ -9,6 +9,7 @@ import sys
 import warnings
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from astropy import units as u
@@ -287,6 +288,19 @@ def test_g12_what_python_writes_says_what_is_known(tmp_path, world):
         and "SEED" not in head
         and "seed" not in meta
     )
+
+
+def test_g12_solutions_and_visibilities_say_what_made_them(tmp_path, world):
+    from instrument.provenance import provenance
+
+    with provenance(object="night", seed=196, scene="0123456789abcdef"):
+        ins.write_h5parm(tmp_path / "s.h5", world.solution)
+        world.vis.save(tmp_path / "v.h5")
+    with h5py.File(tmp_path / "s.h5") as file:
+        said = file["sol000/phase000/val"].attrs["HISTORY000"].decode()
+    assert f"CREATE by instrument {ins.__version__} (object night, seed 196, scene 0123456789abcdef)" in said
+    with h5py.File(tmp_path / "v.h5") as file:
+        assert (file.attrs["object"], file.attrs["seed"], file.attrs["scene"]) == ("night", 196, "0123456789abcdef")
 
 
 def test_g12_warnings_point_at_the_line_of_the_caller(world):
