@@ -63,6 +63,7 @@ _HOME = {
     "read_h5parm": "files.solutions",
     "read_psf": "files.fits_psf",
     "write_h5parm": "files.solutions",
+    "AnyImager": "image.base",
     "Imager": "image.dirty",
     "StokesCube": "image.cube",
     "Psf": "image.cube",

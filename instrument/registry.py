@@ -15,7 +15,7 @@ from typing import Any
 from instrument.checked import checked
 from instrument.errors import PluginError, did_you_mean
 
-KINDS = ("elements", "telescopes", "terms", "engines", "calibrators", "foregrounds", "skies", "stages")
+KINDS = ("elements", "telescopes", "terms", "engines", "calibrators", "imagers", "foregrounds", "skies", "stages")
 
 
 @dataclass(frozen=True)

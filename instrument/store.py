@@ -40,16 +40,18 @@ def write(path: str | os.PathLike[str], blocks: Iterable[Any], overwrite: bool =
 
     Blocks are of the same stations, baselines, phase centre and beam state, and fill times by channels once each.
     """
-    import h5py
-
-    with whole_file(path, overwrite) as partial, h5py.File(partial, "w") as file:
+    with whole_file(path, overwrite) as partial:
         writer = None
-        for block in blocks:
-            writer = writer or _Writer(file, block)
-            writer.add(block)
-        if writer is None:
-            raise InputError("there are no visibilities to save: the set has no block")
-        writer.finish()
+        try:
+            for block in blocks:
+                writer = writer or StoreWriter(partial, block)
+                writer.add(block)
+            if writer is None:
+                raise InputError("there are no visibilities to save: the set has no block")
+            writer.finish()
+        finally:
+            if writer is not None:
+                writer.file.close()
 
 
 def _fixed(block: Any, texts: bool = True) -> dict[str, Any]:
@@ -71,10 +73,13 @@ def _per_time(block: Any) -> dict[str, Any]:
     return {name: found[name] if name in found else getattr(block.at, name) for name in PER_TIME}
 
 
-class _Writer:
-    """A file that is filled block by block."""
+class StoreWriter:
+    """A new file that is filled block by block; `finish` closes it."""
 
-    def __init__(self, file: Any, first: Any) -> None:
+    def __init__(self, path: str | os.PathLike[str], first: Any) -> None:
+        import h5py
+
+        file = h5py.File(path, "w")
         self.file, self.fixed = file, _fixed(first)
         self.known = first.layout, first.beam_state
         self.slots: dict[float, int] = {}
@@ -138,6 +143,7 @@ class _Writer:
         for name, value in self.fixed.items():
             self.file[name] = value
         self.file.attrs.update({"format": FORMAT, "version": VERSION, **written_by()})
+        self.file.close()
 
 
 def _rows(known: dict[float, int], values: Any, what: str) -> slice:

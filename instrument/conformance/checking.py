@@ -14,10 +14,11 @@ from typing import Any, NamedTuple
 
 from instrument.calibrate.base import Calibrator
 from instrument.component import Component
-from instrument.conformance import calibrators, engines, foregrounds, instruments, skies, stages, terms
+from instrument.conformance import calibrators, engines, foregrounds, imagers, instruments, skies, stages, terms
 from instrument.conformance.bench import Broken, bench, demand, fresh, problems
 from instrument.errors import InputError, InstrumentError, InstrumentWarning
 from instrument.foreground.base import ForegroundRemover
+from instrument.image.base import AnyImager
 from instrument.jones.base import JonesTerm
 from instrument.model import Instrument
 from instrument.observe.sampling import Sampling
@@ -155,6 +156,12 @@ def _calibrator(calibrator: Calibrator, at: Sampling | None) -> Iterator[Line]:
         yield _line(claim, calibrator)
 
 
+def _imager(imager: AnyImager, at: Sampling | None) -> Iterator[Line]:
+    yield _line(a_round_trip_through_json_gives_an_equal_object, imager, AnyImager)
+    for claim in imagers.CLAIMS:
+        yield _line(claim, imager)
+
+
 def _remover(remover: ForegroundRemover, at: Sampling | None) -> Iterator[Line]:
     yield _line(a_round_trip_through_json_gives_an_equal_object, remover, ForegroundRemover)
     for claim in foregrounds.CLAIMS:
@@ -173,6 +180,7 @@ CONTRACTS: dict[type[Component], Callable[[Any, Sampling | None], Iterator[Line]
     Sky: _sky,
     Predictor: _engine,
     Calibrator: _calibrator,
+    AnyImager: _imager,
     ForegroundRemover: _remover,
     Stage: _stage,
 }

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Any, Self
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field
 
 from instrument.checked import checked
-from instrument.component import Component
 from instrument.errors import InputError, RefusedError
-from instrument.image.cube import Psf, StokesCube
+from instrument.image.base import AnyImager, ImageSums
+from instrument.image.cube import StokesCube
 from instrument.image.psf import fit_psf
 from instrument.image.weights import Density, Weighting
 from instrument.observe.directions import LIGHT
-from instrument.observe.grid import ImageGrid
-from instrument.units import Complex, Direction, Float, Radians
+from instrument.predict.operator import ImageOperator
+from instrument.units import Complex, Float
 from instrument.visibilities import Visibilities, VisibilitySet
 from instrument.visibility_sets import as_set
 
@@ -26,44 +26,20 @@ WAITING = 96  # bytes of a visibility that waits: u, v, w, weight, I, Q, U, V
 
 
 @checked
-class Imager(Component):
+class Imager(AnyImager):
     """Dirty images of `pixels` x `pixels` of `pixel` each, from baselines within `uv_range` (wavelengths).
 
     `weighting` "natural", "uniform" or "briggs" (with `robust`). The w-term is always there. `accuracy` is that of the
     gridding, relative to the rms of the image. Flagged and non-finite visibilities have no weight.
     """
 
-    pixels: Annotated[int, Field(ge=16, le=32768)]
-    pixel: Annotated[Radians, Field(gt=0)]
-    uv_range: tuple[float, float] | None = None
     weighting: Weighting = "natural"
     robust: Annotated[float, Field(ge=-4, le=4)] = 0.0
     accuracy: Annotated[float, Field(ge=1e-12, le=1e-2)] = 1e-6
 
-    @field_validator("pixels")
-    @classmethod
-    def _even(cls, value: int) -> int:
-        if value % 2:
-            raise InputError(f"pixels = {value} must be even: take {value + 1}")
-        return value
-
-    @model_validator(mode="after")
-    def _on_the_sky(self) -> Self:
-        self.grid().on_the_sky()
-        return self
-
-    def grid(self, centre: Direction | None = None) -> ImageGrid:
-        """The pixels of its images, about a phase centre."""
-        return ImageGrid.of((self.pixels, self.pixels), self.pixel, centre)
-
-    @field_validator("uv_range")
-    @classmethod
-    def _ordered(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
-        if value is not None and not 0 <= value[0] < value[1]:
-            raise InputError(f"uv_range = {value} must be two numbers of wavelengths, the smaller one first")
-        return value
-
-    def image(self, visibilities: VisibilitySet | Iterable[Visibilities]) -> StokesCube:
+    def image(
+        self, visibilities: VisibilitySet | Iterable[Visibilities], operator: ImageOperator | None = None
+    ) -> StokesCube:
         """Dirty images in Jy/beam (F, 4, N, N) with their PSF, of visibilities or of blocks of them.
 
         Blocks must cover channels one after the other or all at once. Weights other than natural go over the blocks
@@ -71,16 +47,10 @@ class Imager(Component):
         """
         natural = self.weighting == "natural"
         given = as_set(visibilities, twice="" if natural else f"{self.weighting} weights")
-        total = self.start(None if natural else self.density(given.coverage()))
+        total = self.start(self.density(given))
         for block in given.blocks():
             total.add(block)
         return total.finish()
-
-    def psf(self, visibilities: VisibilitySet | Iterable[Visibilities]) -> Psf:
-        """The point spread function alone, peak 1."""
-        found = self.image(visibilities).psf
-        assert found is not None
-        return found
 
     def start(self, density: dict[float, Density] | None = None) -> Images:
         """Sums to which blocks are added one by one; `density` is needed for weights other than natural."""
@@ -88,24 +58,25 @@ class Imager(Component):
             raise InputError(f"{self.weighting} weights {'take no' if density else 'need the'} density of the uv plane")
         return Images(self, density)
 
-    def density(self, blocks: Iterable[Visibilities]) -> dict[float, Density]:
+    def density(self, visibilities: VisibilitySet) -> dict[float, Density] | None:
         """Density of the uv plane in every channel (by frequency), for weights other than natural."""
+        if self.weighting == "natural":
+            return None
         found: dict[float, Density] = {}
-        for block in blocks:
+        for block in visibilities.coverage():
             for f, freq in enumerate(block.freq_hz):
                 uvw, weight, _ = self.chosen(block, f)
                 found.setdefault(float(freq), Density(self.pixels, self.pixel)).add(uvw[:, :2], weight)
         return found
 
-    def chosen(self, block: Visibilities, channel: int) -> tuple[Float, Float, Any]:
-        """Baselines in wavelengths (N, 3) within the uv range, their weights (N,), and which ones (T, B) they are."""
-        uvw = block.uvw_m * (block.freq_hz[channel] / LIGHT)
-        weight = np.broadcast_to(block.effective_weight, block.data.shape[:3])[:, channel]
-        use = weight > 0
-        if self.uv_range is not None:
-            length = np.hypot(uvw[..., 0], uvw[..., 1])
-            use = use & (length >= self.uv_range[0]) & (length <= self.uv_range[1])
-        return uvw[use], weight[use], use
+    @property
+    def idle(self) -> bool:
+        """Whether a robust was given that the weighting does not take."""
+        return self.weighting != "briggs" and "robust" in self.model_fields_set
+
+    def error(self) -> str:
+        """That of the gridding."""
+        return f"gridding {self.accuracy:.0e} of the image rms"
 
 
 class _Channel:
@@ -119,7 +90,7 @@ class _Channel:
         self.weight = 0.0
 
 
-class Images:
+class Images(ImageSums):
     """Sums of images over blocks of visibilities; `finish` gives the cube."""
 
     def __init__(self, imager: Imager, density: dict[float, Density] | None) -> None:

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Self, TypeVar
 
 from instrument.component import Component
 from instrument.errors import InputError
-from instrument.image.dirty import Imager
+from instrument.image.base import AnyImager
 from instrument.image.weights import Density
 from instrument.model import Instrument
 from instrument.pipeline.work import Items, StageWork
@@ -95,7 +95,7 @@ class Running:
     model: Visibilities | None = None  # the present block as it was predicted
     parts: dict[str, dict[str, float]] = field(default_factory=dict)  # seconds, by stage, of what it names
     now: str = ""  # the stage at work
-    _densities: dict[str, dict[float, Density]] = field(default_factory=dict)
+    _densities: dict[str, dict[float, Density] | None] = field(default_factory=dict)
 
     @property
     def block(self) -> tuple[int, int, int]:
@@ -117,14 +117,12 @@ class Running:
         finally:
             parts[part] = parts.get(part, 0.0) + time.perf_counter() - begin
 
-    def density(self, imager: Imager) -> dict[float, Density] | None:
+    def density(self, imager: AnyImager) -> dict[float, Density] | None:
         """Density of the uv plane that the weights of an imager need, over the whole run; `None` for natural ones."""
-        if imager.weighting == "natural":
-            return None
         key = imager.fingerprint()
         if key not in self._densities:
             with self.timed("weights"):
-                self._densities[key] = imager.density(self.plan.coverage())
+                self._densities[key] = imager.density(self.plan)
         return self._densities[key]
 
     def stage(self, name: str, kind: type[S]) -> S | None:

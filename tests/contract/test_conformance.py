@@ -62,6 +62,10 @@ SETTINGS: dict[tuple[str, ...], list[dict[str, Any]]] = {
     ],
     ("terms", "gain"): [{}, {"rms": 0.1}],
     ("calibrators", "selfcal"): [{}],
+    ("imagers", "dirty"): [
+        {"pixels": 64, "pixel": 6 * u.arcmin},
+        {"pixels": 64, "pixel": 6 * u.arcmin, "weighting": "briggs", "robust": 0.5, "accuracy": 1e-4},
+    ],
     ("stages", "noise"): [{"sefd": 100 * u.Jy, "seed": 1}],
     ("stages", "calibrate"): [{"calibrator": instrument.SelfCal(tolerance=1e-8)}],
     ("stages", "calibrate.incomplete-model"): [{"laboratory": instrument.IncompleteModel(models=(1, 3))}],

@@ -17,8 +17,8 @@ from instrument.calibrate.selfcal import SelfCal
 from instrument.component import KIND, Component
 from instrument.errors import InputError, Outcome, did_you_mean
 from instrument.files.solutions import write_h5parm
+from instrument.image.base import ImageSums
 from instrument.image.cube import StokesCube
-from instrument.image.dirty import Images
 from instrument.jones.chain import Chain
 from instrument.numbers import brief
 from instrument.pipeline.stage import Beside, Draw, Running, Stage, StageResult, StageRun
@@ -97,7 +97,7 @@ class _CalibrateRun(StageRun):
 
     solver: Calibrator
     run: Running
-    images: dict[str, Images]
+    images: dict[str, ImageSums]
     parts: list[Solution] = field(default_factory=list)
     errors: DISums | None = None
     power: dict[str, float] = field(default_factory=dict)

@@ -9,21 +9,26 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from instrument.component import Component
-from instrument.errors import unused
+from instrument.component import KIND, Component
+from instrument.errors import InputError, did_you_mean, unused
+from instrument.image.base import AnyImager, ImageSums
 from instrument.image.cube import StokesCube
-from instrument.image.dirty import ALL_HELD, HELD, WAITING, Imager, Images
+from instrument.image.dirty import ALL_HELD, HELD, WAITING, Imager
 from instrument.memory import afford
+from instrument.numbers import brief
 from instrument.observe.directions import LIGHT
 from instrument.pipeline.stage import Beside, Draw, Running, Stage, StageResult, StageRun
 from instrument.pipeline.work import Items, StageWork
 from instrument.plan import Item, count_of
+from instrument.registry import load, names
 from instrument.report.page import Card, Figures, Section, Table, number
 from instrument.scene import Scene
+from instrument.units import si_prefix
 from instrument.visibilities import Visibilities
 
 # seconds of a visibility on two cores: gridded in one plane; picked out, with its Stokes parameters
 GRIDDING, PICKING = 0.9e-6, 0.3e-6
+KEEPING = 2e-6  # seconds of a visibility that is kept in a file, read and imaged
 GRIDDED = 250.0  # bytes of a visibility while it is gridded
 
 
@@ -32,12 +37,15 @@ class Image(Stage):
 
     after: ClassVar[tuple[str, ...]] = ("noise", "calibrate", "correct")
     settings_of: ClassVar[tuple[type[Component], ...]] = (Imager,)
-    imager: Imager
+    imager: AnyImager
 
     @classmethod
     def from_table(cls, settings: Mapping[str, Any], beside: Beside) -> Self:
-        """The stage; the settings are those of the imager."""
-        return cls(imager=Imager(**settings))
+        """The stage; `kind` is an imager, "dirty" unless said, the other settings are its own."""
+        kind = settings.get(KIND, "dirty")
+        if kind not in names("imagers"):
+            raise InputError(f"kind = {brief(kind)}: {did_you_mean(str(kind), names('imagers'))}")
+        return cls(imager=load("imagers", kind, **{k: v for k, v in settings.items() if k != KIND}))
 
     def ranges(self) -> tuple[tuple[float, float] | None, ...]:
         """That of the imager."""
@@ -49,7 +57,7 @@ class Image(Stage):
         what = f"image.pixels = {pixels}: images of {channels} channels"
         # 5 planes of sums, 4 of the cube, and 3 of one that is being gridded or transformed
         afford(8.0 * 12 * channels * pixels**2, what, "lower image.pixels, or the number of channels")
-        if self.imager.weighting != "briggs" and "robust" in self.imager.model_fields_set:
+        if isinstance(self.imager, Imager) and self.imager.idle:
             unused("[image]", ["robust"], f"it is of weighting = 'briggs', and this is '{self.imager.weighting}'")
 
     def work(self, run: Running) -> StageWork:
@@ -67,14 +75,25 @@ class Image(Stage):
         """The stage at work."""
         return _ImageRun(self.imager, self.sums(run))
 
-    def sums(self, run: Running) -> Images:
+    def sums(self, run: Running) -> ImageSums:
         """Empty sums of images, with the weights of this run."""
         return self.imager.start(run.density(self.imager))
 
 
-def imaging(imager: Imager, run: Running, count: int = 1) -> StageWork:
+def imaging(imager: AnyImager, run: Running, count: int = 1) -> StageWork:
     """What `count` sets of images of the visibilities of a run cost."""
     channels, plane = run.plan.problem.shape[1], 8.0 * imager.pixels**2
+    if not isinstance(imager, Imager):  # of which only the size is known
+        return StageWork(
+            f"{count_of(count * channels, 'image')} of {imager.pixels} x {imager.pixels} by {type(imager).__name__}, "
+            f"from {si_prefix(64 * count * run.visibilities, 'B')} of files",
+            seconds=count * KEEPING * run.visibilities,
+            block_bytes=3 * 64.0 * float(np.prod(run.block)),
+            finish_bytes=count * 10 * channels * plane,
+            result_bytes=count * 5 * channels * plane,
+            wrong=imager.error(),
+            remedy="lower image.pixels, or the number of channels",
+        )
     chosen = run.visibilities * inside(imager.uv_range, run)
     seconds = GRIDDING * 5 * chosen + PICKING * run.visibilities + 2e-7 * 5 * channels * imager.pixels**2
     together = min(HELD, chosen / channels)
@@ -85,7 +104,7 @@ def imaging(imager: Imager, run: Running, count: int = 1) -> StageWork:
         block_bytes=GRIDDED * together + 8 * 4 * plane + 128.0 * float(np.prod(run.block)),
         finish_bytes=GRIDDED * together + 8 * 4 * plane,
         result_bytes=count * 5 * channels * plane,
-        wrong=f"gridding {imager.accuracy:.0e} of the image rms",
+        wrong=imager.error(),
         remedy="lower image.pixels, or the number of channels",
     )
 
@@ -103,7 +122,7 @@ def inside(uv_range: tuple[float, float] | None, run: Running) -> float:
 
 
 class _ImageRun(StageRun):
-    def __init__(self, imager: Imager, images: Images) -> None:
+    def __init__(self, imager: AnyImager, images: ImageSums) -> None:
         self.imager, self.images = imager, images
 
     def take(self, block: Visibilities) -> Visibilities:
@@ -120,18 +139,18 @@ class _ImageRun(StageRun):
 class ImageResult(StageResult):
     """Images of a run: a cube with its PSF."""
 
-    imager: Imager
+    imager: AnyImager
     cube: StokesCube
 
     def record(self) -> dict[str, Any]:
         """Unit, PSF and rms of the first channel."""
-        psf = self.cube.psf
-        assert psf is not None
+        psf, error = self.cube.psf, self.imager.error()
+        widths = () if psf is None else (psf.major_rad, psf.minor_rad)
         return {
-            "stage_errors": {"image": f"gridding {self.imager.accuracy:.0e} of the image rms asked for"},
+            "stage_errors": {"image": f"{error} asked for"} if error else {},
             "image": {
                 "unit": self.cube.unit,
-                "psf_arcmin": [round(float(np.rad2deg(x[0]) * 60), 3) for x in (psf.major_rad, psf.minor_rad)],
+                "psf_arcmin": [round(float(np.rad2deg(x[0]) * 60), 3) for x in widths],
                 "rms": {s: float(np.nanstd(self.cube.data[0, k])) for k, s in enumerate("IQUV")},
             },
         }
@@ -142,6 +161,8 @@ class ImageResult(StageResult):
 
     def cards(self) -> list[Card]:
         """The PSF."""
+        if self.cube.psf is None:
+            return []
         major, minor = (number(width) for width in self.record()["image"]["psf_arcmin"])
         return [Card("PSF", f"{major}′ × {minor}′", "width at half maximum")]
 
@@ -149,7 +170,7 @@ class ImageResult(StageResult):
         """Images of the first channel, the PSF, and the rms of each Stokes parameter."""
         from instrument.report.images import psf_image, stokes_images
 
-        entries = [draw("images", stokes_images(self.cube), "Dirty images of the four Stokes parameters.", wide=True)]
+        entries = [draw("images", stokes_images(self.cube), "Images of the four Stokes parameters.", wide=True)]
         if self.cube.psf is not None and self.cube.psf.data is not None:
             text = "Point spread function and the Gaussian fitted to its main lobe."
             entries.append(draw("psf", psf_image(self.cube), text))

@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any, ClassVar, Self
 
 from instrument.calibrate.directional import DirectionalCal
-from instrument.component import Component
+from instrument.component import KIND, Component
+from instrument.errors import InputError
 from instrument.experiments.incomplete_model import SOLVED_TOGETHER, IncompleteModel
 from instrument.experiments.incomplete_model_result import Sweep
 from instrument.experiments.many_directions import ManyDirections
 from instrument.experiments.many_directions_result import ManyDirectionsResult
 from instrument.image.dirty import Imager
+from instrument.numbers import brief
 from instrument.pipeline.stage import Beside, Draw, Running, Stage, StageResult, StageRun
 from instrument.pipeline.stages.calibrate import solving
 from instrument.pipeline.stages.image import imaging
@@ -44,7 +46,12 @@ class IncompleteModelStage(Stage):
     @classmethod
     def from_table(cls, settings: Mapping[str, Any], beside: Beside) -> Self:
         """The stage, with the noise and the images of the scene."""
-        image = {"image": Imager(**beside.tables["image"])} if "image" in beside.tables else {}
+        table = dict(beside.tables.get("image", {}))
+        if (kind := table.pop(KIND, "dirty")) != "dirty":
+            raise InputError(
+                f"[image] kind = {brief(kind)}: this laboratory adds images up block by block, as 'dirty' does"
+            )
+        image = {"image": Imager(**table)} if "image" in beside.tables else {}
         return cls(laboratory=IncompleteModel(**{**image, **_common(beside), **settings}))
 
     def work(self, run: Running) -> StageWork:

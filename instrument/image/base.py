@@ -1,0 +1,135 @@
+"""AnyImager: what makes images of visibilities, a plugin kind; and sums of images to which blocks are added."""
+
+from __future__ import annotations
+
+import tempfile
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Self
+
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from instrument.checked import checked
+from instrument.component import Component
+from instrument.errors import InputError, RefusedError
+from instrument.image.cube import Psf, StokesCube
+from instrument.image.weights import Density
+from instrument.observe.directions import LIGHT
+from instrument.observe.grid import ImageGrid
+from instrument.predict.operator import ImageOperator
+from instrument.store import StoreWriter
+from instrument.units import Direction, Float, Radians
+from instrument.visibilities import Visibilities, VisibilitySet
+from instrument.visibility_sets import VisibilityFile
+
+
+class ImageSums(ABC):
+    """Images in the making: blocks are added as they come by, `finish` gives the cube."""
+
+    @abstractmethod
+    def add(self, block: Visibilities) -> None:
+        """Add a block."""
+
+    @abstractmethod
+    def finish(self) -> StokesCube:
+        """The cube; raises `RefusedError` where nothing was added."""
+
+
+@checked
+class AnyImager(Component):
+    """Makes images of `pixels` x `pixels` of `pixel` each, of baselines within `uv_range` (wavelengths).
+
+    A subclass writes `image`. Those that can add blocks up as they come by write `start` too; for the others a run
+    keeps the blocks in a file until all are there.
+    """
+
+    plugin_kind: ClassVar[str | None] = "imagers"
+    pixels: Annotated[int, Field(ge=16, le=32768)]
+    pixel: Annotated[Radians, Field(gt=0)]
+    uv_range: tuple[float, float] | None = None
+
+    @field_validator("pixels")
+    @classmethod
+    def _even(cls, value: int) -> int:
+        if value % 2:
+            raise InputError(f"pixels = {value} must be even: take {value + 1}")
+        return value
+
+    @model_validator(mode="after")
+    def _on_the_sky(self) -> Self:
+        self.grid().on_the_sky()
+        return self
+
+    @field_validator("uv_range")
+    @classmethod
+    def _ordered(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
+        if value is not None and not 0 <= value[0] < value[1]:
+            raise InputError(f"uv_range = {value} must be two numbers of wavelengths, the smaller one first")
+        return value
+
+    def grid(self, centre: Direction | None = None) -> ImageGrid:
+        """The pixels of its images, about a phase centre."""
+        return ImageGrid.of((self.pixels, self.pixels), self.pixel, centre)
+
+    @abstractmethod
+    def image(
+        self, visibilities: VisibilitySet | Iterable[Visibilities], operator: ImageOperator | None = None
+    ) -> StokesCube:
+        """Images in Jy/beam (F, 4, N, N) of visibilities or of blocks of them, gone through as often as needed.
+
+        `operator` is the map from images to these visibilities, for imagers that know beams or subtract what they find.
+        """
+
+    def chosen(self, block: Visibilities, channel: int) -> tuple[Float, Float, Any]:
+        """Baselines in wavelengths (N, 3) within the uv range, their weights (N,), and which ones (T, B) they are."""
+        uvw = block.uvw_m * (block.freq_hz[channel] / LIGHT)
+        weight = np.broadcast_to(block.effective_weight, block.data.shape[:3])[:, channel]
+        use = weight > 0
+        if self.uv_range is not None:
+            length = np.hypot(uvw[..., 0], uvw[..., 1])
+            use = use & (length >= self.uv_range[0]) & (length <= self.uv_range[1])
+        return uvw[use], weight[use], use
+
+    def psf(self, visibilities: VisibilitySet | Iterable[Visibilities]) -> Psf:
+        """The point spread function alone, peak 1; raises `RefusedError` where its images have none."""
+        found = self.image(visibilities).psf
+        if found is None:
+            raise RefusedError(f"{type(self).__name__} gives no PSF")
+        return found
+
+    def density(self, visibilities: VisibilitySet) -> dict[float, Density] | None:
+        """What weights need to know of all visibilities before the first is added; `None`: nothing."""
+        return None
+
+    def start(self, density: dict[float, Density] | None = None) -> ImageSums:
+        """Sums to which blocks are added one by one."""
+        return Kept(self)
+
+    def error(self) -> str:
+        """How wrong its images may be, in words."""
+        return ""
+
+
+class Kept(ImageSums):
+    """Blocks kept in a file of their own, for an imager that goes through all of them, or more than once."""
+
+    def __init__(self, imager: AnyImager) -> None:
+        self.imager = imager
+        self.folder = tempfile.TemporaryDirectory(prefix="instrument-")
+        self.path = Path(self.folder.name) / "blocks.h5"
+        self.writer: StoreWriter | None = None
+
+    def add(self, block: Visibilities) -> None:
+        """Write a block."""
+        self.writer = self.writer or StoreWriter(self.path, block)
+        self.writer.add(block)
+
+    def finish(self) -> StokesCube:
+        """The images; the file is gone afterwards."""
+        with self.folder:
+            if self.writer is None:
+                raise RefusedError("no block of visibilities was given: nothing to image")
+            self.writer.finish()
+            return self.imager.image(VisibilityFile(self.path))
