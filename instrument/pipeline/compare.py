@@ -262,24 +262,33 @@ def _images(name: str, a: RunRead, b: RunRead) -> list[Column]:
     from instrument.files.fits_open import opened
 
     with opened(a.files[name]) as one, opened(b.files[name]) as two:
-        x, y = one[0].data, two[0].data
-        if x is None or y is None:
-            return []
-        if x.shape != y.shape:
-            raise InputError(f"images of {x.shape}, and {y.shape}")
-        sums, largest, where = np.zeros(3), 0.0, ""
-        for index in np.ndindex(*x.shape[:-2]):
-            u, v = np.asarray(x[index], float), np.asarray(y[index], float)
-            both = np.isfinite(u) & np.isfinite(v)
-            apart = np.where(both, v - u, 0.0)
-            sums += (apart**2).sum(), (u[both] ** 2).sum(), both.sum()
-            top = np.inf if (np.isfinite(u) != np.isfinite(v)).any() else float(np.abs(apart).max(initial=0.0))
-            if top > largest:
-                largest, where = top, f"plane {'.'.join(map(str, index))}" if index else ""
-        scale = float(np.sqrt(sums[1] / max(sums[2], 1))) or 1.0
-        return [
-            Column(name, "images", x.size, float(np.sqrt(sums[0] / max(sums[2], 1))) / scale, largest / scale, where)
-        ]
+        if [hdu.name for hdu in one] != [hdu.name for hdu in two]:
+            raise InputError("the files have other images or tables than one another")
+        found = []
+        for x, y in zip(one, two, strict=True):
+            if x.is_image and x.data is not None and y.data is not None:
+                label = x.name.lower() if x.name not in ("", "PRIMARY") else "images"
+                found.append(_planes(name, label, x.data, y.data))
+        if not found:
+            raise InputError("there is no image in it")
+        return found
+
+
+def _planes(name: str, label: str, x: Any, y: Any) -> Column:
+    """How two images (..., Ny, Nx) differ, plane by plane: two of them in memory at once."""
+    if x.shape != y.shape:
+        raise InputError(f"{label} of {x.shape}, and {y.shape}")
+    sums, largest, where = np.zeros(3), 0.0, ""
+    for index in np.ndindex(*x.shape[:-2]):
+        u, v = np.asarray(x[index], float), np.asarray(y[index], float)
+        both = np.isfinite(u) & np.isfinite(v)
+        apart = np.where(both, v - u, 0.0)
+        sums += (apart**2).sum(), (u[both] ** 2).sum(), both.sum()
+        top = np.inf if (np.isfinite(u) != np.isfinite(v)).any() else float(np.abs(apart).max(initial=0.0))
+        if top > largest:
+            largest, where = top, f"plane {'.'.join(map(str, index))}" if index else ""
+    scale = float(np.sqrt(sums[1] / max(sums[2], 1))) or 1.0
+    return Column(name, label, x.size, float(np.sqrt(sums[0] / max(sums[2], 1))) / scale, largest / scale, where)
 
 
 def _solutions(path: Path) -> dict[str, Float]:

@@ -96,7 +96,7 @@ def test_wrong_words_on_the_command_line_are_one_clear_line(tiny, capsys):
     assert "other.toml" in refused(capsys, "plan", "other.toml")
     assert "--set" in refused(capsys, "plan", "tiny.toml", "--set", "novalue")
     assert "memory" in refused(capsys, "plan", "tiny.toml", "--memory", "3")
-    assert "limit" in refused(capsys, "plan", "tiny.toml", "--memory", "1 kB")
+    assert "give more memory (--memory)" in refused(capsys, "plan", "tiny.toml", "--memory", "1 kB")
     assert "--workers" in refused(capsys, "plan", "tiny.toml", "--workers", "0")
 
 

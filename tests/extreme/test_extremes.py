@@ -964,8 +964,8 @@ def test_two_runs_of_one_name_at_a_time_do_not_share_a_folder(tiny, monkeypatch)
 
     inner, started = run._compute, []
 
-    def compute(result):
-        inner(result)
+    def compute(*given):
+        inner(*given)
         if not started:
             started.append(True)
             assert main(["run", "tiny.toml"]) == 0

@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 from astropy import units as u
+from astropy.io import fits
 from astropy.table import Table
 
 import instrument as ins
@@ -112,6 +113,18 @@ def test_tables_and_cubes_are_compared_number_by_number(runs):
     values = np.full((8, 8), 2.0) + np.eye(8)
     assert cube.where == "plane 1.3" and cube.largest == pytest.approx(0.6 / np.sqrt((values**2).mean()), rel=1e-6)
     assert set(found) == {("spectrum_spherical_I.ecsv", "power"), ("leakage.ecsv", "I"), ("cube.fits", "images")}
+
+
+def test_every_image_of_a_file_is_compared(runs):
+    for name, value in (("a", 1.0), ("b", 1.5)):
+        depth = fits.ImageHDU(np.full((3, 3), value), name="DEPTH")
+        fits.HDUList([fits.PrimaryHDU(), depth, fits.ImageHDU(np.ones((3, 3)), name="PEAK")]).writeto(
+            runs / name / "p.fits"
+        )
+        fits.HDUList([fits.PrimaryHDU()]).writeto(runs / name / "empty.fits")
+    found = compare("a", "b")
+    assert [(c.column, c.rms) for c in found.columns if c.file == "p.fits"] == [("depth", 0.5)]
+    assert "empty.fits: there is no image in it" in found.apart
 
 
 def test_a_run_is_the_same_as_itself(runs, capsys):
