@@ -1,5 +1,8 @@
 """Cubes of the reports on foreground removal: leaked Faraday screens, quiet and under noise."""
 
+from datetime import date
+from pathlib import Path
+
 import numpy as np
 from astropy import units as u
 
@@ -53,3 +56,24 @@ def removers():
         "stokes-templates": load("stokes-templates"),
     }
     return found | ({"ica": load("ica")} if find_spec("sklearn") else {})
+
+
+def asked(only):
+    """The removers of a run: all of them, or those that `--only` names, with a comma between."""
+    every = removers()
+    return {name: every[name] for name in only.split(",")} if only else every
+
+
+def merged(page, only, rows, table):
+    """Rows by remover, with those of the page that is there where only some were asked; `table` is its number on it."""
+    if only:
+        parts = Path(page).read_text().split("\n|---")[1:]
+        lines = parts[table].splitlines()[1:]
+        there = {line.split(" | ")[0].removeprefix("| "): line for line in lines if line.startswith("| ")}
+        rows = {name: rows.get(name, there.get(name)) for name in removers() if name in rows or name in there}
+    return "\n".join(rows.values())
+
+
+def made(only):
+    """A line that says which rows are younger than the others."""
+    return f"\nRows of {only}: {date.today()}, by `--only {only}`.\n" if only else ""

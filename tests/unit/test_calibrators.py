@@ -139,6 +139,19 @@ def test_judged_is_what_a_solver_says_of_the_same_matrices():
     assert found.gauge.count == due.gauge.count and found.interval_s == due.interval_s
 
 
+def test_judged_knows_stations_that_nothing_ties_to_the_others():
+    model = calibrators._model()
+    one = np.broadcast_to(np.eye(2), (6, 2, 10, 2, 2)).astype(complex)
+    still, few = np.ones((6, 2), bool), np.zeros((6, 2, 45), bool)
+    apart = (model.antenna1 < 3) != (model.antenna2 < 3)
+    few[0, :, apart], few[1, :, (model.antenna1 < 5) == (model.antenna2 < 5)] = True, True
+    data, solver = model.flagged(few), SelfCal()
+    found, due = judged(solver, data, model, one, still, np.ones(1)), solver.solve(data, model)
+    assert np.array_equal(found.outcome, due.outcome) and found.outcome[1, 0] is Outcome.SINGULAR
+    assert np.array_equal(np.isfinite(found.jones), np.isfinite(due.jones))
+    assert np.isnan(found.jones[0, 0, :3]).all() and np.isfinite(found.jones[0, 0, 3:]).all()
+
+
 def test_judged_never_takes_what_does_not_fit_or_is_not_known():
     model = calibrators._model()
     one = np.broadcast_to(np.eye(2), (6, 2, 10, 2, 2)).astype(complex)
