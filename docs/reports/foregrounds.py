@@ -11,13 +11,12 @@ import os
 import platform
 import sys
 import time
-from datetime import date
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 from astropy import units as u
-from leakage_cubes import CASES, SCREENS, asked, leakage, load, made, merged, observed, removers
+from leakage_cubes import CASES, SCREENS, asked, leakage, load, made, merged, observed, removers, since
 
 from instrument import Analyzer
 from instrument.image.mocks import polarized_screens
@@ -82,7 +81,7 @@ def main():
     times = {name: f"| {name} | {min(s):.2f} | {quiet[name]} |" for name, s in spent.items()}
     text = f"""# Foreground removers on leaked polarization
 
-{date.today()}, {os.cpu_count()} cores ({platform.machine()}), Python {platform.python_version()},
+{since(page, given.only)}, {os.cpu_count()} cores ({platform.machine()}), Python {platform.python_version()},
 numpy {version("numpy")}, numba {version("numba")}, instrument {version("instrument")}.
 Made by `python docs/reports/foregrounds.py --pixels {given.pixels}{" --gmca4im FOLDER" if given.gmca4im else ""}`.
 {made(given.only)}

@@ -74,6 +74,11 @@ def merged(page, only, rows, table):
     return "\n".join(rows.values())
 
 
+def since(page, only):
+    """The date of the page: that of the page that is there, where only some of its rows are made anew."""
+    return Path(page).read_text().splitlines()[2].split(",")[0] if only else date.today()
+
+
 def made(only):
     """A line that says which rows are younger than the others."""
     return f"\nRows of {only}: {date.today()}, by `--only {only}`.\n" if only else ""

@@ -7,12 +7,11 @@ Writes signal_loss.md beside this file. Per (k_perp, k_par): `signal_loss(remove
 
 import argparse
 import warnings
-from datetime import date
 from importlib.metadata import version
 from pathlib import Path
 
 from astropy import units as u
-from leakage_cubes import asked, leakage, made, merged, observed
+from leakage_cubes import asked, leakage, made, merged, observed, since
 
 from instrument import InstrumentWarning, signal_loss
 from instrument.analyze.power.signal import Signal21cm
@@ -46,7 +45,7 @@ def main():
         )
     text = f"""# Signal left by every foreground remover
 
-{date.today()}, instrument {version("instrument")}.
+{since(page, given.only)}, instrument {version("instrument")}.
 Made by `python docs/reports/signal_loss.py --pixels {given.pixels}`.
 {made(given.only)}
 A 21-cm cube of `{model.name}` ({1e3 * signal.data[:, 0].std():.1f} mK rms a voxel) is added to 7.1 mK of leaked
