@@ -23,6 +23,7 @@ class Answers(SelfCal):
     """SelfCal whose answer is spoilt: each class below in one way."""
 
     tolerance: float = 1e-6
+    iterations: int = 80
 
     def solve(self, data, model, /):
         return self.spoilt(super().solve(data, model), data, model)
