@@ -24,6 +24,7 @@ from instrument.model import Instrument
 from instrument.observe.sampling import Sampling
 from instrument.pipeline.stage import Stage
 from instrument.predict.base import Predictor
+from instrument.predict.direct import Direct
 from instrument.sky.base import Sky
 
 
@@ -141,7 +142,8 @@ def _engine(engine: Predictor, at: Sampling | None) -> Iterator[Line]:
         return
     served = {name: problem for name, problem in some.items() if engine.refuses(problem) is None}
     for name, problem in served.items():
-        yield _line(engines.it_agrees_with_direct, engine, problem, after=f": {name}")
+        due = engines.due_of(name, isinstance(engine, Direct))
+        yield _line(engines.it_agrees_with_direct, engine, problem, due, after=f": {name}")
         if problem.sky.kind == "image":
             yield _line(engines.its_adjoint_is_that_of_its_sums, engine, problem, after=f": {name}")
     last = {problem.sky.kind == "image": problem for problem in served.values()}

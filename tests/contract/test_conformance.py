@@ -486,7 +486,14 @@ class FirstTimeOnly(Direct):
         return np.repeat(one, problem.shape[0], axis=0)
 
 
-class KnowsNoPairs(Direct):
+class OneSource(Direct):
+    """Serves one problem of the bench: quick."""
+
+    def refuses(self, problem):
+        return None if problem.sky.count == 1 else "one source only"
+
+
+class KnowsNoPairs(OneSource):
     def prepare(self, problem, tolerance):
         return _AllBaselines(self, problem)
 
@@ -498,8 +505,11 @@ class _AllBaselines(Blockwise):
 
 
 class ConjugateAdjoint(Direct):
+    def refuses(self, problem):
+        return None if problem.sky.kind == "image" else "images only"
+
     def prepare(self, problem, tolerance):
-        return _Conjugate(self, problem) if problem.sky.kind == "image" else Blockwise(self, problem)
+        return _Conjugate(self, problem)
 
 
 class _Conjugate(DirectImages):
@@ -507,7 +517,7 @@ class _Conjugate(DirectImages):
         return super().adjoint(data.conj(), times, channels, pairs)
 
 
-class Drifting(Direct):
+class Drifting(OneSource):
     """Wrong by up to 3e-7, in a way that comes back with every atom of two times, and says so: sound."""
 
     claimed: tuple[int, int] = (2, 1)
@@ -517,9 +527,6 @@ class Drifting(Direct):
         if tolerance < self.bound:
             raise RefusedError(f"drifts by {self.bound:g}: give a tolerance of that")
         return _Drift(self, problem, self.bound, self.claimed)
-
-    def refuses(self, problem):
-        return "knows no images" if problem.sky.kind == "image" else None
 
 
 class _Drift(Blockwise):
