@@ -56,7 +56,8 @@ def _no_horizon(problem: Problem) -> list[Item]:
     first = problem.block(slice(0, 1), slice(None))
     hidden = float(flux(first.sky, first.at)[..., below].sum(axis=-1).max())
     when = f"{never} throughout" if never else "for part of the time"
-    text = f"{count_of(int(below.sum()), 'direction')} ({si_prefix(hidden, 'Jy')}) below it, {when}, seen in full"
+    what = "cell" if problem.sky.kind == "image" else "direction"
+    text = f"{count_of(int(below.sum()), what)} ({si_prefix(hidden, 'Jy')}) below it, {when}, seen in full"
     return [Item("horizon", f"no term is blind there: {text}")]
 
 

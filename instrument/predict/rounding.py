@@ -15,9 +15,10 @@ from instrument.mat2 import UNIT
 from instrument.observe.directions import LIGHT
 from instrument.observe.sampling import Sampling
 from instrument.predict.base import CHUNK, Problem
+from instrument.sky.image import ImageSky
 from instrument.sky.points import FLUX_CELLS, points_of
 from instrument.sky.rounding import brightness_rounding, flux
-from instrument.units import Float
+from instrument.units import Float, unit_vectors
 
 SEEN = 16  # roundings of an apparent direction in the axes of a station: angles, M (s + v), unit length, axes
 PRODUCT = 12  # of a product of two 2x2 matrices
@@ -94,7 +95,7 @@ def _phase(problem: Problem) -> Float:
 
 def _jones(problem: Problem) -> Float:
     """Rounding of J_a B J_b^H for a source of unit brightness, (S,) or (1,)."""
-    at, parts, near = problem.at, problem.chain.parts, problem.sky.reach_rad
+    at, parts = problem.at, problem.chain.parts
     if not parts:
         return np.zeros(1)
     peaks = [t.peak(at) for t in parts]
@@ -106,6 +107,8 @@ def _jones(problem: Problem) -> Float:
         wrong = wrong + others * term.rounding(at)
     # azimuths are good to a rounding over the distance from the zenith. An element that is one smooth field there turns
     # back what Parallactic turns, so that what is left is its jump; at a horizon, above or below is chance
+    placed = any(isinstance(t, ElementBeam | Parallactic) for t in parts) or problem.chain.blind_below_horizon
+    zenith, horizon = _nearest(problem) if placed else (np.ones(1), np.ones(1))
     elements = [(k, t) for k, t in enumerate(parts) if isinstance(t, ElementBeam)]
     turned = any(isinstance(t, Parallactic) for t in parts)
     if elements or turned:
@@ -113,8 +116,46 @@ def _jones(problem: Problem) -> Float:
         if turned and elements:
             k, element = elements[0]
             jump = element.jump(at) * float(np.prod(peaks[:k] + peaks[k + 1 :]))
-        wrong = wrong + jump * np.minimum(UNIT * SEEN / np.maximum(at.rising.zenith - near, UNIT), np.pi)
+        wrong = wrong + jump * np.minimum(UNIT * SEEN / np.maximum(zenith, UNIT), np.pi)
     if problem.chain.blind_below_horizon:
-        wrong = wrong + np.where(at.rising.horizon - near < UNIT * SEEN, whole, 0.0)
+        wrong = wrong + np.where(horizon < UNIT * SEEN, whole, 0.0)
     with np.errstate(over="ignore"):  # then nothing is known
         return np.asarray(2 * whole * wrong + wrong**2)
+
+
+def _nearest(problem: Problem) -> tuple[Float, Float]:
+    """How near each direction comes to a zenith and to an antenna plane, sines (N,); of an image its nearest pixel.
+
+    Pixels are looked at one by one only at the times when their cell is near: for 1024 x 1024 pixels and 2880 times all
+    of them would take minutes.
+    """
+    at, sky = problem.at, problem.sky
+    least = np.array([at.rising.zenith, at.rising.horizon])
+    if not isinstance(sky, ImageSky):
+        return least[0], least[1]
+    reach = sky.reach_rad
+    near = np.flatnonzero(np.any(least < 2 * reach, axis=0))
+    least = np.where(least < 2 * reach, reach, least - reach)  # the others are never nearer than that
+    pixels, cell = sky.pixels_of(near)
+    if not len(pixels):
+        return least[0], least[1]
+    centres, vectors = unit_vectors(*sky.outline())[near], unit_vectors(*sky.grid.directions(pixels))
+    where = np.searchsorted(near, cell)
+    zeniths = at.layout.axes[at.layout.frames[0], 2]
+    for matrix, velocity in zip(at.earth.matrices, at.earth.velocity, strict=True):
+        axes = zeniths @ matrix  # ICRS
+        up = centres @ axes.T + axes @ velocity  # to 1e-4 of itself: |v + velocity| is left out
+        close = np.minimum(np.abs(up), np.sqrt(np.maximum(1 - up**2, 0))).min(axis=1) < 2 * reach
+        chosen = np.flatnonzero(close[where])
+        if not chosen.size:
+            continue
+        up = vectors[chosen] @ axes.T + axes @ velocity
+        # 1 - up^2 has no digits at the zenith: |axis x (v + velocity)| has
+        aside = np.sqrt(np.maximum(1 - up**2, 0))
+        k, g = np.nonzero(aside < 1e-3)
+        aside[k, g] = np.linalg.norm(np.cross(axes[g], vectors[chosen[k]] + velocity), axis=1)
+        first = np.flatnonzero(np.diff(cell[chosen], prepend=-1))  # pixels are in the order of their cells
+        for distance, each in zip(least, (aside, np.abs(up)), strict=True):
+            lowest = 0.999 * np.minimum.reduceat(each.min(axis=1), first)
+            np.minimum.at(distance, cell[chosen[first]], lowest)
+    return least[0], least[1]

@@ -126,6 +126,15 @@ class ImageSky(PlacedSky):
         first, second = (np.linspace(0, n, min(n, CELLS) + 1).round().astype(int) for n in self.grid.pixels)
         return first, second
 
+    def pixels_of(self, cells: Int) -> tuple[Int, Int]:
+        """Pixels of some cells that are not zero throughout, in the order of cells, and the cell of each, (S,) both."""
+        y, x = np.divmod(self.used, self.grid.pixels[1])
+        row, column = (np.searchsorted(e, at, side="right") - 1 for e, at in zip(self._edges, (y, x), strict=True))
+        cell = row * (len(self._edges[1]) - 1) + column
+        chosen = np.flatnonzero(np.isin(cell, cells))
+        chosen = chosen[np.argsort(cell[chosen], kind="stable")]
+        return self.used[chosen], cell[chosen]
+
     def cells_jy(self, freq_hz: Float) -> Float:
         """|I| + P in every cell of the outline, Jy (F, N)."""
         return np.asarray(self._cells_jy[self._rows(freq_hz)])
