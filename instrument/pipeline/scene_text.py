@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 import os
 import re
 import tomllib
@@ -157,24 +156,6 @@ def _value(text: str, name: str, shown: str) -> Any:
 
 def to_toml(tables: dict[str, Any]) -> str:
     """Tables as TOML text; the inverse of reading them, for what a scene file holds."""
-    lines = [f"{_key(k)} = {_toml(v)}" for k, v in tables.items() if not isinstance(v, dict)]
-    for name, table in tables.items():
-        if isinstance(table, dict):
-            lines += ["", f"[{_key(name)}]", *(f"{_key(k)} = {_toml(v)}" for k, v in table.items())]
-    return "\n".join(lines) + "\n"
+    import tomli_w
 
-
-def _key(name: str) -> str:
-    return name if BARE.fullmatch(name) else _toml(name)
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(_toml(x) for x in value) + "]"
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{_key(k)} = {_toml(x)}" for k, x in value.items()) + " }"
-    return repr(value)
+    return tomli_w.dumps(tables)

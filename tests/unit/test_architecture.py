@@ -287,8 +287,22 @@ def test_every_public_name_resolves():
     assert set(instrument.__all__) <= set(dir(instrument))
 
 
+def test_the_stub_that_type_checkers_read_is_what_the_package_has():
+    found = {}
+    for node in ast.parse((ROOT / "instrument" / "__init__.pyi").read_text()).body:
+        if isinstance(node, ast.ImportFrom):
+            for alias in node.names:
+                assert alias.asname == alias.name, f"{alias.name}: only 'import X as X' is public to a type checker"
+                found[alias.name] = f"instrument.{node.module}" if node.module else "instrument"
+    assert set(found) | {"__version__"} == set(instrument.__all__)
+    for name, home in found.items():
+        one = getattr(instrument, name)
+        module = sys.modules[home]
+        assert getattr(module, name) is one, name
+
+
 def test_a_name_that_is_not_there_is_an_attribute_error():
-    with pytest.raises(AttributeError, match="module 'instrument' has no attribute 'Interferometer'"):
+    with pytest.raises(AttributeError, match="No instrument attribute Interferometer"):
         instrument.Interferometer  # noqa: B018
 
 
