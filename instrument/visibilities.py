@@ -31,6 +31,7 @@ from instrument.visibility_checks import check_baselines, check_weights, positiv
 CANCELS = 1e6  # of a Jones matrix: its inverse twice in double precision leaves 1e-4
 
 
+@checked
 class VisibilitySet(ABC):
     """Visibilities as blocks that can be gone through as often as needed: a plan, a file, a list, one `Visibilities`.
 

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from instrument.checked import checked
 from instrument.errors import InputError, warn
 from instrument.foreground.noise import noise_power
 from instrument.image.cube import Psf, StokesCube
@@ -18,6 +19,7 @@ from instrument.units import Bool, Float, Int
 Plane = Literal["I", "Q", "U", "V"]
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class StokesMaps:
     """Maps (C, Ny, Nx) of the planes that a remover asks for: finite, every channel of `plane` varies, holes are 0.
