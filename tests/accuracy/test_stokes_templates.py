@@ -48,6 +48,7 @@ def test_its_error_is_as_large_as_it_says(truth, rms, shaped, draws):
     assert abs(wrong / said - 1) < 0.15 + 3 * 0.15 / np.sqrt(draws)
 
 
+@LONG
 def test_it_gains_under_noise_where_projections_do_harm(truth):
     cube = noisy(truth, 60e-3)
     ours, filtered = (remover.split(cube) for remover in (templates(), load("foregrounds", "faraday-filter")))
@@ -72,6 +73,7 @@ def test_a_signal_comes_through_at_every_scale(truth):
     ).within((0.0, 0.03))[0]  # fmt: skip
 
 
+@LONG
 def test_a_smooth_sky_that_is_not_in_q_and_u_needs_smooth_terms(truth):
     maps = np.random.default_rng(3).normal(scale=2.0, size=(48, 48)).astype(np.float32)
     smooth = (truth.freq_hz / 150e6)[:, None, None] ** -2.55 * maps
@@ -82,6 +84,7 @@ def test_a_smooth_sky_that_is_not_in_q_and_u_needs_smooth_terms(truth):
     assert left[0] > 1 and left[1] < 1e-3 * truth.data[:, 0].std()
 
 
+@LONG
 def test_channels_weigh_by_their_noise(truth):
     cube = noisy(truth, 1e-3, seed=2, shaped=False)
     data = np.array(cube.data)
