@@ -185,8 +185,8 @@ def calls():
         ("Separation.nothing", ins.Separation.nothing, {
             "maps": np.zeros((2, 3)), "outcome": ins.Outcome.REFUSED, "remark": "none"}),
         ("StokesMaps", ins.StokesMaps, {
-            "stokes": "I", "planes": {"I": w.cube.data[:, 0]}, "freq_hz": w.cube.freq_hz, "pixel_rad": 1e-3, "unit": "K",
-            "psf": None}),
+            "stokes": "I", "planes": {"I": w.cube.data[:, 0]}, "freq_hz": w.cube.freq_hz, "pixel_rad": 1e-3,
+            "unit": "K", "psf": None}),
         ("Imager.image", ins.Imager(pixels=16, pixel=8 * u.arcmin).image, {"visibilities": w.vis}),
         ("Imager.psf", ins.Imager(pixels=16, pixel=8 * u.arcmin).psf, {"visibilities": w.vis}),
         ("StokesCube", ins.StokesCube, {
