@@ -46,29 +46,12 @@ def make_plan(
     tolerance = TOLERANCE.check(tolerance, "tolerance")
     workers = (os.cpu_count() or 1) if workers is None else COUNT.check(workers, "workers")
     uv_range = None if uv_range is None else UV_RANGE.check(uv_range, "uv_range")
-    layout, chain = instrument.layout(), instrument.chain()
-    if len(layout) < 2:
-        raise InputError(
-            f"an interferometer needs at least two stations, got {', '.join(layout.names)}: one alone has a beam and "
-            "no visibilities"
-        )
-    sky = sky.about(observation.phase_centre)
-    warn_outside_band(chain, observation.freq_hz)
-    ra, dec = sky.outline()
-    channels = observation.freq_hz.size
-    afford(
-        300.0 * channels * len(ra), f"a sky of {len(ra)} directions in {channels} channels", "ask for fewer of either"
-    )
-    at = Sampling.build(layout, observation.times(layout), observation.freq_hz, ra, dec, observation.phase_centre)
-    _must_rise(at)
-    _say_coincident(layout)
-    a, b = layout.baselines
-    full = Problem(at, chain, sky, a, b, observation.interval, observation.width_hz)
+    full = _as_given(instrument, sky, observation)
     scale_jy = _scale(full)
     kept: list[Item] = []
     left_out: list[Item] = []
     budget = Budget(tolerance, rounding(full, scale_jy)) if tolerance > 0 else Budget(0.0, 0.0)
-    chain = _simplify_chain(chain, at, budget, kept, left_out)
+    chain = _simplify_chain(full.chain, full.at, budget, kept, left_out)
     problem = _simplify_sky(full, chain, budget, left_out)
     problem = _within(problem, uv_range, left_out)
     kept.append(_w_term(problem))
@@ -101,6 +84,28 @@ def make_plan(
     )
     vars(plan)["ready"] = ready  # or it would be prepared a second time
     return plan
+
+
+def _as_given(instrument: Instrument, sky: Sky, observation: Observation) -> Problem:
+    """The whole scene as a problem; refused where it cannot be observed or held."""
+    layout, chain = instrument.layout(), instrument.chain()
+    if len(layout) < 2:
+        raise InputError(
+            f"an interferometer needs at least two stations, got {', '.join(layout.names)}: one alone has a beam and "
+            "no visibilities"
+        )
+    placed = sky.about(observation.phase_centre)
+    warn_outside_band(chain, observation.freq_hz)
+    ra, dec = placed.outline()
+    channels = observation.freq_hz.size
+    afford(
+        300.0 * channels * len(ra), f"a sky of {len(ra)} directions in {channels} channels", "ask for fewer of either"
+    )
+    at = Sampling.build(layout, observation.times(layout), observation.freq_hz, ra, dec, observation.phase_centre)
+    _must_rise(at)
+    _say_coincident(layout)
+    a, b = layout.baselines
+    return Problem(at, chain, placed, a, b, observation.interval, observation.width_hz)
 
 
 def _say_coincident(layout: Layout) -> None:
