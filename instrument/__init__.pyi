@@ -38,12 +38,12 @@ from .foreground.maps import StokesMaps as StokesMaps
 from .foreground.separation import Separation as Separation
 from .image.base import AnyImager as AnyImager
 from .image.beam_leakage import leaked_through as leaked_through
-from .image.cube import Psf as Psf
 from .image.cube import StokesCube as StokesCube
 from .image.dirty import Imager as Imager
 from .image.mocks import leaked as leaked
 from .image.mocks import noise_cube as noise_cube
 from .image.mocks import polarized_screens as polarized_screens
+from .image.psf import Psf as Psf
 from .jones import mueller as mueller
 from .jones.base import ElementBeam as ElementBeam
 from .jones.base import JonesTerm as JonesTerm

@@ -8,8 +8,9 @@ from instrument import mat2
 from instrument.observe.directions import EARTH_RATE, LIGHT, separation, tangents
 from instrument.plan import Item, count_of
 from instrument.predict.base import Problem
-from instrument.sky.points import FWHM_TO_SIGMA, points_of
+from instrument.sky.points import points_of
 from instrument.sky.rounding import flux
+from instrument.sky.sources import FWHM_TO_SIGMA
 from instrument.units import Float, Int, si_prefix
 
 SHAPED = 24  # extended sources across which the beam is worked out; the effect of the others is scaled from theirs

@@ -8,11 +8,12 @@ from typing import Any
 
 from instrument.analyze.faraday.cube import FaradayCube
 from instrument.analyze.faraday.synthesis import Division, Precision, rm_synthesis
-from instrument.analyze.power.cells import Cells, cells_of
-from instrument.analyze.power.cylinders import Cylindrical, Spherical, cylindrical, spherical
+from instrument.analyze.power.cells import Cells, cylindrical, spherical
+from instrument.analyze.power.cylinders import Cylindrical, Spherical
 from instrument.analyze.power.fourier import Stokes, Taper
 from instrument.analyze.power.signal import Signal21cm
 from instrument.analyze.power.spectra import Spectrum2D, spectrum_2d
+from instrument.analyze.power.transform import cells_of
 from instrument.analyze.power.window import EoRWindow, eor_window
 from instrument.analyze.sources.leakage import Leakage, leakage_of
 from instrument.analyze.sources.photometry import ForcedPhotometry, SourceFluxes
@@ -230,7 +231,7 @@ class Analyzer:
         """
         if self.cube is None:
             raise InputError("rm_synthesis needs a cube: Analyzer(cube)")
-        say_unequal_beams(self.cube)
+        say_unequal_beams(self.cube.psf)
         given = (depths, stokes, weights, lambda2_0, spectral_index, divide_by_i, precision, out, noise, progress)
         return rm_synthesis(self.cube, *given)
 

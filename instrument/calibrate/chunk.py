@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -12,16 +12,26 @@ from instrument.calibrate.again import Fits
 from instrument.calibrate.fit import strange
 from instrument.calibrate.gauge import UNKNOWNS, Gauge, common, free_counts
 from instrument.calibrate.graph import counted, freedom, tied
-from instrument.calibrate.lanes import Lanes
+from instrument.calibrate.lanes import Lanes, Settings
 from instrument.calibrate.suspects import suspects
 from instrument.errors import Outcome
+from instrument.jones.base import JonesTerm
 from instrument.units import Bool, Complex, Float, Int
 from instrument.visibilities import Visibilities
 
-if TYPE_CHECKING:
-    from instrument.calibrate.selfcal import SelfCal
-
 Cell = tuple[slice, slice]  # times and channels of an interval
+
+
+class SolveSettings(Settings, Protocol):
+    """What a chunk needs to know of a solver."""
+
+    @property
+    def unexplained(self) -> float:
+        """Share of the rms of the data above which what is left is a poor fit."""
+
+    @property
+    def start(self) -> JonesTerm | None:
+        """What to start from."""
 
 
 @dataclass
@@ -42,7 +52,7 @@ class Part:
 class Job:
     """What all chunks of one solve share."""
 
-    settings: SelfCal
+    settings: SolveSettings
     visibilities: Visibilities
     data: Complex
     model: Complex

@@ -18,7 +18,8 @@ from instrument.files.fits_header import Given, Part, affordable, look
 from instrument.files.fits_open import opened
 from instrument.files_in import harmless
 from instrument.image.blanks import without_constants
-from instrument.image.cube import Psf, StokesCube, Unit
+from instrument.image.cube import StokesCube, Unit
+from instrument.image.psf import Psf
 from instrument.units import Float, to_si
 
 NAMES = "IQUV"

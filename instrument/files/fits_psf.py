@@ -11,8 +11,8 @@ import numpy as np
 from instrument.checked import checked
 from instrument.errors import FileError, InputError
 from instrument.files.fits import read_cube
-from instrument.image.cube import Psf, StokesCube
-from instrument.image.psf import fit_psf
+from instrument.image.cube import StokesCube
+from instrument.image.psf import Psf, fit_psf
 
 
 @checked

@@ -11,7 +11,8 @@ import numpy as np
 from instrument.checked import checked
 from instrument.errors import InputError, warn
 from instrument.foreground.noise import noise_power
-from instrument.image.cube import Psf, StokesCube
+from instrument.image.cube import StokesCube
+from instrument.image.psf import Psf
 from instrument.numbers import squarable
 from instrument.shown import short_repr
 from instrument.units import Bool, Float, Int

@@ -14,7 +14,8 @@ from pydantic import Field, field_validator, model_validator
 from instrument.checked import checked
 from instrument.component import Component
 from instrument.errors import InputError, RefusedError
-from instrument.image.cube import Psf, StokesCube
+from instrument.image.cube import StokesCube
+from instrument.image.psf import Psf
 from instrument.image.weights import Density
 from instrument.observe.directions import LIGHT
 from instrument.observe.grid import ImageGrid

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from instrument.errors import InputError, warn
+from instrument.image.psf import Psf
 from instrument.units import Complex, Float
-
-if TYPE_CHECKING:
-    from instrument.image.cube import Psf, StokesCube
 
 ALIKE = 1.05  # of the widths: beams of a fit differ by a per cent
 SLACK = 1e-9  # of the beam: rounding of a channel that has the common beam already
@@ -25,9 +23,9 @@ def beam_ratio(psf: Psf | None) -> float:
     return float(width.max() / width.min()) if width.size else 1.0
 
 
-def say_unequal_beams(cube: StokesCube) -> None:
+def say_unequal_beams(psf: Psf | None) -> None:
     """Warn where the channels of a cube have beams of different widths, with their ratio."""
-    if (ratio := beam_ratio(cube.psf)) > ALIKE:
+    if (ratio := beam_ratio(psf)) > ALIKE:
         said = f"the beams of the channels differ by a factor of {ratio:.3g} in width: sources that are not points, and"
         warn(f"{said} close pairs, change along frequency; cube.at_common_beam() makes them equal")
 
@@ -60,15 +58,11 @@ def common_beam(psf: Psf) -> Float:
     return np.asarray(np.eye(2) * psf.major_rad[known].max() ** 2 / (8 * np.log(2)))
 
 
-def at_common_beam(cube: StokesCube, size: Any = None) -> StokesCube:
-    """The cube blurred to one beam; see `StokesCube.at_common_beam`."""
-    from instrument.image.cube import Psf
-
-    if cube.psf is None:
-        raise InputError("a common beam needs the beams of the cube: give psf=Psf.gaussian(major, minor, angle)")
-    psf, outer = cube.psf, _asked(cube.psf, size)
+def at_common_beam(images: Float, psf: Psf, pixel_rad: float, per_beam: bool, size: Any) -> tuple[Float, Psf]:
+    """Images (F, 4, Ny, Nx), `per_beam` in Jy/beam, blurred to one beam, and that; see `StokesCube.at_common_beam`."""
+    outer = _asked(psf, size)
     known = np.isfinite(psf.major_rad) & (psf.major_rad > 0) & (psf.minor_rad > 0)
-    there = np.array([not np.isnan(planes).all() for planes in cube.data])
+    there = np.array([not np.isnan(planes).all() for planes in images])
     if (lacking := there & ~known).any():
         k = int(np.flatnonzero(lacking)[0])
         raise InputError(f"channel {k} has data and no beam: flag it, cube.flagged([{k}]), or give psf=")
@@ -82,28 +76,26 @@ def at_common_beam(cube: StokesCube, size: Any = None) -> StokesCube:
         raise InputError(
             f"size = {size} is smaller than the beam {had} in some direction: leave it out, or ask for more"
         )
-    data = np.array(cube.data, np.result_type(cube.data, np.float32))
-    images = None if psf.data is None else np.array(psf.data, float)
+    data = np.array(images, np.result_type(images, np.float32))
+    lobes = None if psf.data is None else np.array(psf.data, float)
     for k in np.flatnonzero(usable).tolist():
         kernel = outer - inner[k]
         # of Jy/beam the beam grows: a point of 1 Jy stays 1
-        gain = float(np.sqrt(np.linalg.det(outer) / np.linalg.det(inner[k]))) if cube.unit == "Jy/beam" else 1.0
+        gain = float(np.sqrt(np.linalg.det(outer) / np.linalg.det(inner[k]))) if per_beam else 1.0
         for plane in data[k]:
             if np.isfinite(plane).any():
-                plane[:] = gain * blurred(plane, kernel / cube.pixel_rad**2)
-        if images is not None:
+                plane[:] = gain * blurred(plane, kernel / pixel_rad**2)
+        if lobes is not None:
             grown = float(np.sqrt(np.linalg.det(outer) / np.linalg.det(inner[k])))
-            images[k] = grown * blurred(images[k], kernel / cube.pixel_rad**2)
+            lobes[k] = grown * blurred(lobes[k], kernel / pixel_rad**2)
     powers, axes = np.linalg.eigh(outer)
     minor, major = np.sqrt(8 * np.log(2) * np.maximum(powers, 0))
     angle = np.arctan2(axes[1, 1], axes[0, 1]) % np.pi
     one = (np.full(len(known), float(value)) for value in (major, minor, angle, 0.0))
-    return cube.with_data(data).with_psf(Psf(images, *one))
+    return data, Psf(lobes, *one)
 
 
 def _asked(psf: Psf, size: Any) -> Float:
-    from instrument.image.cube import Psf
-
     if size is None:
         return common_beam(psf)
     parts = [part.strip() for part in size.split(",")] if isinstance(size, str) else size

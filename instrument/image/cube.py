@@ -14,64 +14,16 @@ from instrument.image.blanks import without_constants
 from instrument.image.channels import channel_index, in_band
 from instrument.image.common_beam import at_common_beam
 from instrument.image.cube_file import write_cube
+from instrument.image.psf import Psf
 from instrument.observe.directions import LIGHT
 from instrument.observe.grid import ImageGrid
 from instrument.shown import short_repr
 from instrument.sky.image import ImageSky
-from instrument.units import Count, Direction, Float, one_si, to_si
+from instrument.units import Direction, Float, one_si, to_si
 
 BOLTZMANN = 1.380649e-23  # J/K
 JY = 1e-26  # W m^-2 Hz^-1
 Unit = Literal["Jy/beam", "Jy/pixel", "K"]
-
-
-@checked
-@dataclass(frozen=True, eq=False)
-class Psf:
-    """Point spread function (F, Ny, Nx), peak 1 at the centre pixel, and the Gaussian fitted to its main lobe.
-
-    `major_rad`, `minor_rad` are full widths at half maximum, `angle_rad` is the position angle of the major axis, north
-    through east, (F,) each; `residual` is the largest difference between lobe and Gaussian above half maximum. `data`
-    is None where only the widths are known, as in a FITS file.
-    """
-
-    __repr__ = short_repr
-    data: Float | None
-    major_rad: Float
-    minor_rad: Float
-    angle_rad: Float
-    residual: Float
-
-    @classmethod
-    def gaussian(cls, major: Any, minor: Any = None, angle: Any = None) -> Psf:
-        """A Gaussian beam known by its widths alone: full widths at half maximum and position angle, one or (F,) each.
-
-        Quantities, NaN where a channel has none; `minor` is `major` unless given, `angle` (of the major axis, north
-        through east) is 0.
-        """
-        widths = (
-            to_si(m, "rad", n, nan=True) for m, n in ((major, "major"), (major if minor is None else minor, "minor"))
-        )
-        turned = 0.0 if angle is None else to_si(angle, "rad", "angle", nan=True)
-        a, b, pa = np.broadcast_arrays(*(np.atleast_1d(np.asarray(x, float)) for x in (*widths, turned)))
-        return cls(None, a, b, pa, np.zeros(len(a)))
-
-    def of(self, channels: Count) -> Psf:
-        """The same for so many channels: one beam becomes that of all; raises `InputError` for any other number."""
-        given = {len(x) for x in (self.major_rad, self.minor_rad, self.angle_rad, self.residual)}
-        given |= set() if self.data is None else {len(self.data)}
-        if given == {channels}:
-            return self
-        if given != {1}:
-            raise InputError(f"the PSF has {' and '.join(map(str, sorted(given)))} channels, the cube {channels}")
-        data = None if self.data is None else np.broadcast_to(self.data, (channels, *self.data.shape[1:]))
-        four = (self.major_rad, self.minor_rad, self.angle_rad, self.residual)
-        return Psf(data, *(np.repeat(x, channels) for x in four))
-
-    @property
-    def solid_angle_sr(self) -> Float:
-        """Solid angle of the fitted Gaussian, sr (F,)."""
-        return np.pi / (4 * np.log(2)) * self.major_rad * self.minor_rad
 
 
 @checked
@@ -234,7 +186,10 @@ class StokesCube:
         largest beam of the cube unless given, or a circle around all where none holds the others. Pixels without data
         stay so and weigh nothing. Raises `InputError` for channels with data and no beam, or with a larger one.
         """
-        return at_common_beam(self, size)
+        if self.psf is None:
+            raise InputError("a common beam needs the beams of the cube: give psf=Psf.gaussian(major, minor, angle)")
+        data, psf = at_common_beam(self.data, self.psf, self.pixel_rad, self.unit == "Jy/beam", size)
+        return self.with_data(data).with_psf(psf)
 
     def _with(self, **changes: Any) -> StokesCube:
         from astropy import units as u

@@ -3,20 +3,36 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
+from instrument.image.psf import Psf
 from instrument.provenance import fits_cards
+from instrument.units import Direction, Float
 from instrument.whole_file import whole_file
-
-if TYPE_CHECKING:
-    from instrument.image.cube import StokesCube
 
 TABLE = "FREQS"  # of the frequencies of an axis FREQ-TAB
 
 
-def write_cube(cube: StokesCube, path: str | os.PathLike[str], overwrite: bool = False) -> None:
+class _Cube(Protocol):
+    """What is written of a `StokesCube`."""
+
+    @property
+    def data(self) -> Float: ...
+    @property
+    def freq_hz(self) -> Float: ...
+    @property
+    def unit(self) -> str: ...
+    @property
+    def centre(self) -> Direction | None: ...
+    @property
+    def psf(self) -> Psf | None: ...
+    @property
+    def wcs(self) -> Any: ...
+
+
+def write_cube(cube: _Cube, path: str | os.PathLike[str], overwrite: bool = False) -> None:
     """Write a FITS cube in float32, whole or not at all; see `StokesCube.write`."""
     from astropy.io import fits
 

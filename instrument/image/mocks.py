@@ -16,7 +16,8 @@ from pydantic import Field
 from instrument.checked import checked
 from instrument.component import Component
 from instrument.errors import InputError
-from instrument.image.cube import Psf, StokesCube
+from instrument.image.cube import StokesCube
+from instrument.image.psf import Psf
 from instrument.memory import afford
 from instrument.observe.directions import LIGHT
 from instrument.units import Complex, Float, Radians, Seed, direction, to_si

@@ -17,12 +17,13 @@ from instrument.files.fits import read_cube
 from instrument.files.fits_psf import read_psf
 from instrument.files.number_list import read_frequencies, read_numbers
 from instrument.image.channels import channel_numbers, in_band
-from instrument.image.cube import Psf, StokesCube
+from instrument.image.cube import StokesCube
+from instrument.image.psf import Psf
 from instrument.pipeline.folder import RunFolder
 from instrument.pipeline.progress import progress_bar
 from instrument.pipeline.record import costs, json_text, spent, versions
 from instrument.pipeline.stages.cube import CubeAnalysis
-from instrument.pipeline.stages.cube_results import CubeResults
+from instrument.pipeline.stages.cube_page import CubeResults
 from instrument.provenance import provenance
 from instrument.units import Float
 

@@ -16,8 +16,9 @@ from instrument.observe.directions import LIGHT
 from instrument.observe.sampling import Sampling
 from instrument.predict.base import CHUNK, Problem
 from instrument.sky.image import ImageSky
-from instrument.sky.points import FLUX_CELLS, points_of
+from instrument.sky.points import points_of
 from instrument.sky.rounding import brightness_rounding, flux
+from instrument.sky.sources import FLUX_CELLS
 from instrument.units import Float, unit_vectors
 
 SEEN = 16  # roundings of an apparent direction in the axes of a station: angles, M (s + v), unit length, axes

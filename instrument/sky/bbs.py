@@ -13,7 +13,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -21,10 +21,11 @@ from instrument.errors import InputError, did_you_mean, unused, warn
 from instrument.files_in import SHOWN, harmless
 from instrument.observe.directions import LIGHT, tangents
 from instrument.sky.bbs_text import Line, angle, broken, lines_of
-from instrument.sky.points import PointSky
+from instrument.sky.sources import Sources
 from instrument.units import Direction, Float
 from instrument.whole_file import whole_file
 
+S = TypeVar("S", bound=Sources)
 ARCSEC = np.pi / 180 / 3600
 MISORIENTED = np.deg2rad(0.1)  # orientations of fitted components are rarely better than a degree
 
@@ -73,7 +74,7 @@ def _check_polarization(line: Line) -> None:
 
 
 def _source(line: Line) -> dict[str, Any]:
-    """One source as plain numbers, by the names of the PointSky fields and a few more."""
+    """One source as plain numbers, by the names of the fields of `Sources` and a few more."""
     ra, dec = angle(line, "Ra"), angle(line, "Dec")
     if ra is None or dec is None:
         raise line.fail(f"{'Ra' if ra is None else 'Dec'} of '{line['Name']}' is missing")
@@ -102,8 +103,8 @@ def _source(line: Line) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def read_bbs(path: Path, text: Sequence[str], centre: Direction | None = None) -> PointSky:
-    """Sources of BBS text; raises `FileError` with line and field.
+def read_bbs(make: type[S], path: Path, text: Sequence[str], centre: Direction | None = None) -> S:
+    """Sources of BBS text, a list of the class `make`; raises `FileError` with line and field.
 
     Orientations count from the m axis of the phase centre unless OrientationIsAbsolute: from `centre` they are turned
     into angles from each source's own north (minus the angle of that north in the l, m plane of the centre). DP3 draws
@@ -143,7 +144,7 @@ def read_bbs(path: Path, text: Sequence[str], centre: Direction | None = None) -
     unused(harmless(path.name), flat, "axes of a POINT")
     unused(harmless(path.name), without_name, "a patch has no flux, and a source needs a Name")
     _unique(path, rows)
-    return _sky(path, rows, centre)
+    return _sky(make, path, rows, centre)
 
 
 def _unique(path: Path, rows: list[dict[str, Any]]) -> None:
@@ -167,7 +168,7 @@ def _unique(path: Path, rows: list[dict[str, Any]]) -> None:
         )
 
 
-def _sky(path: Path, rows: list[dict[str, Any]], centre: Direction | None) -> PointSky:
+def _sky(make: type[S], path: Path, rows: list[dict[str, Any]], centre: Direction | None) -> S:
     def column(key: str) -> Any:
         return np.array([r[key] for r in rows])
 
@@ -177,7 +178,7 @@ def _sky(path: Path, rows: list[dict[str, Any]], centre: Direction | None) -> Po
     frequency = np.where(frequency > 0, frequency, known[0] if len(known) else 150e6)
     width = max(len(r["terms"]) for r in rows)
     shape, rotates, rm = column("shape"), column("rotates"), column("rm")
-    sky = PointSky(
+    sky = make(
         names=tuple(r["name"] for r in rows),
         patches=tuple(r["patch"] for r in rows) if any(r["patch"] for r in rows) else (),
         ra_rad=column("ra"),
@@ -203,7 +204,7 @@ def _sky(path: Path, rows: list[dict[str, Any]], centre: Direction | None) -> Po
     return sky.with_fields(**fields)
 
 
-def _convergence(path: Path, sky: PointSky, centre: Direction | None, turned: Any) -> Float | float:
+def _convergence(path: Path, sky: Sources, centre: Direction | None, turned: Any) -> Float | float:
     """What turns an orientation in the l, m plane of the centre into one from the source's own north, rad (S,)."""
     at = centre or sky.middle
     (east,), (north,) = tangents(np.array([at.ra_rad]), np.array([at.dec_rad]))
@@ -228,7 +229,7 @@ WRITTEN = (
 UNWRITABLE = re.compile(r"[,'\"\[\]\n\r]|^\s|\s$|^#|^$|^format\s*=", re.IGNORECASE)
 
 
-def write_bbs(path: Any, sky: PointSky, overwrite: bool = False) -> None:
+def write_bbs(path: Any, sky: Sources, overwrite: bool = False) -> None:
     """Write a sky as BBS text that `read_bbs` (and DP3) read back; raises `InputError` for what the format cannot hold.
 
     Values are written with all their digits, positions in degrees, orientations as absolute ones. A patch stands at
@@ -246,7 +247,7 @@ def write_bbs(path: Any, sky: PointSky, overwrite: bool = False) -> None:
         partial.write_text("\n".join(out) + "\n", encoding="utf-8")
 
 
-def _check_names(sky: PointSky) -> None:
+def _check_names(sky: Sources) -> None:
     for kind, names in (("source", sky.names), ("patch", [p for p in sky.patches if p])):
         for name in names:
             if UNWRITABLE.search(name):
@@ -263,7 +264,7 @@ def _degrees(angle_rad: Any) -> str:
     return f"{float(np.rad2deg(angle_rad))!r}deg"
 
 
-def _written(sky: PointSky, k: int) -> list[str]:
+def _written(sky: Sources, k: int) -> list[str]:
     """The fields of one source, in the order of the format line."""
 
     def of(values: Any, default: Any = 0.0) -> Any:

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from instrument.errors import InputError
 from instrument.files_in import harmless
+from instrument.sky.sources import Sources
 from instrument.units import Float
-
-if TYPE_CHECKING:
-    from instrument.sky.points import PointSky
 
 FAR = 1.5  # a spectrum is a fit over a band: beyond this factor of its frequency it is a guess
 
 
-def doubts(sky: PointSky, freq_hz: Float) -> dict[str, str]:
+def doubts(sky: Sources, freq_hz: Float) -> dict[str, str]:
     """A thing and what is doubtful about it, {} for nothing; raises `InputError` where a flux is not finite."""
     with np.errstate(over="ignore", invalid="ignore"):
         stokes = sky.stokes(freq_hz)
@@ -32,7 +28,7 @@ def doubts(sky: PointSky, freq_hz: Float) -> dict[str, str]:
     return out | ({"not read": "; ".join(sky.not_read)} if sky.not_read else {})
 
 
-def _negative(sky: PointSky, intensity: Float, freq_hz: Float) -> list[str]:
+def _negative(sky: Sources, intensity: Float, freq_hz: Float) -> list[str]:
     """Sources whose I is positive where it was measured and negative at a frequency asked for."""
     turned = np.where(sky.stokes_jy[:, 0] >= 0, intensity, 0.0)
     count = int((turned < 0).any(axis=0).sum())
@@ -46,7 +42,7 @@ def _negative(sky: PointSky, intensity: Float, freq_hz: Float) -> list[str]:
     ]
 
 
-def _far(sky: PointSky, freq_hz: Float) -> list[str]:
+def _far(sky: Sources, freq_hz: Float) -> list[str]:
     """How far from where it was measured the flux of a source is taken, where that is far."""
     if sky.reference_hz is None:
         return []

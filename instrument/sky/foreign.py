@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from instrument.errors import unused
 from instrument.files_in import harmless
 from instrument.sky.bbs_text import broken
-from instrument.sky.points import PointSky
+from instrument.sky.sources import Sources
 
+S = TypeVar("S", bound=Sources)
 TABLE = "write its sources as BBS text or as a table of named columns"
 # name of the format, what a comment or the first line of data begins with, and the way out
 TEXTS: tuple[tuple[str, str, str], ...] = (
@@ -57,8 +59,8 @@ def refuse_foreign(path: Path, raw: bytes) -> None:
             raise broken(path, None, f"is {title}, which is not read here; {remedy}")
 
 
-def read_oskar(path: Path, raw: bytes) -> PointSky:
-    """Sources of an OSKAR sky model: up to 12 numbers a line, in its order and units; missing ones are 0.
+def read_oskar(make: type[S], path: Path, raw: bytes) -> S:
+    """Sources of an OSKAR sky model, as `make`: up to 12 numbers a line in its order and units, missing ones are 0.
 
     Q, U and V carry the spectrum of I and turn with the rotation measure; without a reference frequency (0) nothing
     changes with frequency, as OSKAR takes it.
@@ -91,7 +93,7 @@ def read_oskar(path: Path, raw: bytes) -> PointSky:
     index, turn = (np.where(still, 0.0, data[m]) for m in ("spectral_index", "rotation_measure"))
     arcsec = np.pi / 180 / 3600
     shaped = bool((data["major"] > 0).any() or (data["minor"] > 0).any())
-    return PointSky(
+    return make(
         names=tuple(f"s{k}" for k in range(len(rows))),
         ra_rad=np.deg2rad(data["ra"]),
         dec_rad=np.deg2rad(data["dec"]),

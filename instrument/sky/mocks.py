@@ -187,8 +187,6 @@ class MockField(GeneratedSky):
 
     def place(self, centre: Direction) -> PointSky:
         """The sources."""
-        from instrument.sky.readers import read
-
         rng = np.random.default_rng(self.seed)
         flux = np.concatenate([[MODEL_JY, SECOND_JY], mock_fluxes(rng)[1]])
         ra, dec = _vlssr_positions()
@@ -204,7 +202,7 @@ class MockField(GeneratedSky):
         sky = _power_laws(names, ra, dec, stokes, 150e6, index)
         if not self.components:
             return sky
-        return PointSky.join(read("3c196_pandey.skymodel", FIELD), sky.select(np.arange(1, len(sky))))
+        return PointSky.join(PointSky.read("3c196_pandey.skymodel", FIELD), sky.select(np.arange(1, len(sky))))
 
     def _pair(self, rng: Any, ra: Float, dec: Float, left: int) -> None:
         """Moves some of the last `left` sources beside an earlier one, in place."""

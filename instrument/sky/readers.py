@@ -1,130 +1,20 @@
-"""Readers of catalogues: `read` takes a file in any of the known forms, `Catalogue` is a sky made of one."""
+"""Catalogue: a sky of the sources of a file, or of the brightest of them, or with a model in place of one."""
 
 from __future__ import annotations
 
-import os
-from importlib.resources import files
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from pydantic import model_validator
 
-from instrument.component import Component
-from instrument.errors import FileError, InputError, did_you_mean
-from instrument.files_in import GZIP, harmless, read_regular
+from instrument.errors import InputError
 from instrument.numbers import Count
-from instrument.sky.bbs import read_bbs
-from instrument.sky.bbs_text import broken, is_bbs
-from instrument.sky.binary_tables import fits_table, votable
-from instrument.sky.foreign import read_oskar, refuse_foreign
+from instrument.sky.forms import check_choices
 from instrument.sky.mocks import GeneratedSky
 from instrument.sky.points import PointSky
-from instrument.sky.table_sky import Choices, Incomplete, Sizes, sky_of
-from instrument.sky.text_tables import text_table
-from instrument.units import Direction, Hertz, Radians, SkyDirection
-
-BBS_SUFFIXES = (".skymodel", ".sky", ".bbs")
-CARRIED_TABLES = ("mock_150mhz.csv",)  # the other tables of the package are no skies
-CATALOGUE_BYTES = 200_000_000  # NVSS has 1.8 million sources in 180 MB; whole surveys beyond that are to be cut
-
-
-class _Reading(Component):
-    """Brings what a reader is told in the forms that fields take."""
-
-    centre: SkyDirection | None = None
-    sizes: Sizes | None = None
-    beam: Radians | None = None
-    frequency: Hertz | None = None
-    incomplete: Incomplete = "refuse"
-
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
-        _check_choices(self.beam, self.frequency)
-        return self
-
-
-def _check_choices(beam: float | None, frequency: float | None) -> None:
-    if beam is not None and not 0 < beam < np.pi:
-        raise InputError(f"beam = {np.rad2deg(beam) * 3600:g} arcsec must be above 0 and below 180 deg")
-    if frequency is not None and frequency <= 0:
-        raise InputError(f"frequency = {frequency:g} Hz must be above 0")
-
-
-def read(
-    path: Any,
-    centre: Any = None,
-    sizes: Sizes | None = None,
-    beam: Any = None,
-    frequency: Any = None,
-    incomplete: Incomplete = "refuse",
-) -> PointSky:
-    """Sources of a file on disk, or of one that the package carries ("3c196_pandey.skymodel", "mock_150mhz.csv").
-
-    BBS text, an OSKAR model (.osm), or a table as CSV, ECSV, FITS or VOTable, also packed by gzip; which one is told
-    from the content. A table needs positions and a flux; the names and units that are understood, and the surveys that
-    are known by their columns, stand in docs/skies.md. Columns that are not read are named in a warning and in the
-    plan. What a table leaves open is asked for: `sizes` = "points" or "as given" and `beam` (its FWHM) where there are
-    only sizes fitted to an image, `frequency` of the fluxes, and `incomplete` = "leave out" or "no effect" for sources
-    that lack a value (also -999 and the like); the usual "refuse" tells the first of them. `centre` (SkyCoord or text)
-    is the phase centre that BBS files may count orientations from; see `read_bbs` for what is done without it. Raises
-    `FileError` with file, line, field and remedy.
-    """
-    told = _Reading(centre=centre, sizes=sizes, beam=beam, frequency=frequency, incomplete=incomplete)
-    choices = Choices(told.sizes, told.beam, told.frequency, told.incomplete)
-    file = _find(path)
-    raw = read_regular(file, CATALOGUE_BYTES, "catalogue", unzip=True)
-    if raw.startswith(GZIP):
-        raise broken(file, None, "gzip within gzip; unpack it")
-    start = raw[:1024].lstrip(b"\xef\xbb\xbf").lstrip()
-    if start.startswith(b"SIMPLE"):
-        return sky_of(fits_table(file, raw), choices)
-    if b"<VOTABLE" in raw[:4096].upper() or b":VOTABLE" in raw[:4096].upper():
-        return sky_of(votable(file, raw), choices)
-    name = file.name.lower().removesuffix(".gz")
-    of_bbs = is_bbs(_head(raw))
-    if not of_bbs:
-        refuse_foreign(file, raw)
-    if name.endswith(".osm"):
-        return read_oskar(file, raw)
-    if b"\0" not in raw[:4096] and (name.endswith(BBS_SUFFIXES) or of_bbs):
-        return read_bbs(file, _lines(file, raw), told.centre)
-    return sky_of(text_table(file, raw), choices)
-
-
-def _find(path: Any) -> Path:
-    """The file of a path, or of the package where it is a bare name that is not there."""
-    try:
-        file = Path(path).expanduser()
-    except (TypeError, RuntimeError) as error:  # no path at all; `~` without a home
-        raise FileError(f"catalogue {harmless(repr(path), 80)} is no path of a file: {harmless(error)}") from None
-    if os.path.lexists(file):
-        if (file / "table.dat").is_file():
-            raise FileError(
-                f"'{harmless(path)}' is a CASA table, which is not read as a sky; write its sources as BBS text or "
-                "as a table of named columns"
-            )
-        return file
-    there = files("instrument.data").iterdir()
-    carried = {f.name: f for f in there if f.name.endswith(".skymodel") or f.name in CARRIED_TABLES}
-    if len(file.parts) == 1 and file.name in carried:
-        return Path(str(carried[file.name]))
-    near = did_you_mean(harmless(file.name, 60), carried)
-    raise FileError(f"no file '{harmless(path, 200)}' on disk, nor among those of the package: {near}")
-
-
-def _head(raw: bytes) -> list[str]:
-    return raw[:65536].decode("utf-8-sig", errors="replace").split("\n")
-
-
-def _lines(file: Path, raw: bytes) -> list[str]:
-    try:
-        lines = raw.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    except UnicodeDecodeError as error:
-        raise broken(file, raw[: error.start].count(b"\n") + 1, "not UTF-8 text; save it as such") from None
-    if not any(t.strip() for t in lines):
-        raise broken(file, None, "the file is empty")
-    return lines
+from instrument.sky.table_sky import Incomplete, Sizes
+from instrument.units import Direction, Hertz, Radians
 
 
 class Catalogue(GeneratedSky):
@@ -133,7 +23,8 @@ class Catalogue(GeneratedSky):
     `brightest` keeps that many of largest |I| + P at their reference frequencies. `model` names a file whose components
     (one source) replace what the catalogue has within `match` of their mean direction, as one patch, called as in that
     file or else as the file; the model counts as one source. `sizes`, `beam`, `frequency` and `incomplete` say what a
-    table leaves open, as in `read`. Raises `FileError`, and `InputError` when nothing is there
+    table leaves open, as in
+    `PointSky.read`. Raises `FileError`, and `InputError` when nothing is there
     to be replaced.
     """
 
@@ -148,7 +39,7 @@ class Catalogue(GeneratedSky):
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
-        _check_choices(self.beam, self.frequency)
+        check_choices(self.beam, self.frequency)
         return self
 
     def place(self, centre: Direction) -> PointSky:
@@ -157,10 +48,10 @@ class Catalogue(GeneratedSky):
 
         beam = None if self.beam is None else self.beam * u.rad
         frequency = None if self.frequency is None else self.frequency * u.Hz
-        sky = read(self.path, centre, self.sizes, beam, frequency, self.incomplete)
+        sky = PointSky.read(self.path, centre, self.sizes, beam, frequency, self.incomplete)
         if self.model is None:
             return sky if self.brightest is None else sky.brightest(self.brightest)
-        model = read(self.model, centre)
+        model = PointSky.read(self.model, centre)
         name = model.patches[0] if len(set(model.patches)) == 1 and model.patches[0] else Path(self.model).stem
         return _with_model(sky, model, name, self.match, self.brightest)
 

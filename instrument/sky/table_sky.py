@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -11,10 +11,11 @@ from instrument.errors import InputError
 from instrument.files_in import SHOWN, harmless
 from instrument.sky.bbs_text import broken
 from instrument.sky.columns import FITTED_BESIDE, KEPT, MEANINGS, bare, default_unit
-from instrument.sky.points import PointSky
+from instrument.sky.sources import Sources
 from instrument.sky.tables import Column, Table, say, say_unread, unit_scale
 from instrument.units import Float
 
+S = TypeVar("S", bound=Sources)
 # values that catalogues write where they have none; an angle or a rotation measure of -99 may be meant
 PLACEHOLDERS = (-999.0, -9999.0, -99999.0)
 HAVE_NO_EFFECT = (
@@ -27,7 +28,7 @@ Incomplete = Literal["refuse", "leave out", "no effect"]
 
 @dataclass(frozen=True)
 class Choices:
-    """What the reader of a table has to be told where the table leaves it open; see `readers.read`."""
+    """What the reader of a table has to be told where the table leaves it open; see `forms.read_as`."""
 
     sizes: Sizes | None = None
     beam_rad: float | None = None
@@ -35,8 +36,8 @@ class Choices:
     incomplete: Incomplete = "refuse"
 
 
-def sky_of(table: Table, choices: Choices) -> PointSky:
-    """The sky of a table; raises `FileError` with line or row, column and remedy."""
+def sky_of(make: type[S], table: Table, choices: Choices) -> S:
+    """The sky of a table, a list of the class `make`; raises `FileError` with line or row, column and remedy."""
     _refuse_misspelt(table)
     if not len(table):
         raise broken(table.path, None, "no source in it")
@@ -58,7 +59,7 @@ def sky_of(table: Table, choices: Choices) -> PointSky:
     chosen = {m: v[rows] for m, v in values.items()}
     names = table.columns["name"].texts if "name" in table.columns else None
     patches = table.columns["patch"].texts if "patch" in table.columns else None
-    return _sky(table, chosen, rows, names, patches, unread)
+    return _sky(make, table, chosen, rows, names, patches, unread)
 
 
 def _values(table: Table, meaning: str, column: Column) -> Float:
@@ -295,14 +296,20 @@ def _refuse_misspelt(table: Table) -> None:
 
 
 def _sky(
-    table: Table, data: dict[str, Float], rows: Any, names: Any, patches: Any, unread: tuple[str, ...]
-) -> PointSky:
+    make: type[S],
+    table: Table,
+    data: dict[str, Float],
+    rows: Any,
+    names: Any,
+    patches: Any,
+    unread: tuple[str, ...],
+) -> S:
     none = np.zeros(len(rows))
     terms = [data[t] for t in ("spectral_index", "spectral_curvature") if t in data]
     if len(rows) > 2 and terms and np.median(terms[0]) > 0.3:
         say(table, f"most spectral indices are positive (median {np.median(terms[0]):.2g}); fluxes go as (f/f0)^index")
     try:
-        return PointSky(
+        return make(
             names=tuple(names[k] for k in rows) if names else tuple(f"s{k}" for k in rows),
             patches=tuple(patches[k] for k in rows) if patches and any(patches) else (),
             ra_rad=data["ra"],

@@ -10,7 +10,7 @@ from astropy.cosmology import Planck15
 from instrument import Analyzer, InputError, StokesCube
 from instrument.analyze.power.cylinders import ratio
 from instrument.analyze.power.fourier import HYDROGEN, taper_of
-from instrument.image.cube import Psf
+from instrument.image.psf import Psf
 from instrument.observe.directions import LIGHT
 
 PIXEL = 2 * u.arcmin

@@ -6,7 +6,8 @@ from astropy import units as u
 from astropy.table import QTable
 
 from instrument import Analyzer, InputError, Signal21cm, StokesCube, ixr, mueller
-from instrument.analyze.power.cells import Cells, Frame
+from instrument.analyze.power.bins import Frame
+from instrument.analyze.power.cells import Cells
 from instrument.analyze.power.cylinders import Cylindrical
 from instrument.analyze.power.window import eor_window
 from instrument.errors import InstrumentWarning, UnitError

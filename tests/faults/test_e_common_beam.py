@@ -37,7 +37,7 @@ def cube(unit="Jy/beam", psf=PSF):
 def test_e14_unequal_beams_are_said_with_their_ratio():
     assert beam_ratio(PSF) == pytest.approx(np.sqrt(12 / 7.5))
     with pytest.warns(InstrumentWarning, match="beams of the channels differ by a factor of 1.26 in width"):
-        say_unequal_beams(cube())
+        say_unequal_beams(cube().psf)
     with pytest.warns(InstrumentWarning, match="differ by a factor of 1.26 in width"):
         Analyzer(cube()).rm_synthesis([0.0, 1.0])
 

@@ -158,7 +158,7 @@ def test_b7_numbers_of_removers_go_through_the_door(name, settings):
 
 
 def test_f14_a_score_that_is_not_known_is_not_called_held():
-    from instrument.pipeline.stages.cube_results import CubeResults
+    from instrument.pipeline.stages.cube_page import CubeResults
 
     class Settings:
         def to_dict(self):

@@ -7,7 +7,7 @@ import pytest
 
 from instrument.errors import FileError, InstrumentWarning, UnusedWarning
 from instrument.sky.bbs import write_bbs
-from instrument.sky.readers import read
+from instrument.sky.points import PointSky
 
 PLACE = "08:13:36, +48.13.03"
 LSMTOOL = (
@@ -20,7 +20,7 @@ LSMTOOL = (
 def bbs(tmp_path):
     def made(*lines, name="m.skymodel"):
         (tmp_path / name).write_text("\n".join(lines) + "\n")
-        return read(tmp_path / name)
+        return PointSky.read(tmp_path / name)
 
     return made
 
@@ -57,7 +57,7 @@ def test_a4_a_name_in_two_patches_is_made_unique_by_its_patch_and_written_back(b
     assert sky.names == ("s0", "CygA:s0", "s1")
     assert sky.stokes_jy[:, 0].tolist() == [3, 5, 7]
     write_bbs(tmp_path / "w.skymodel", sky)
-    again = read(tmp_path / "w.skymodel")
+    again = PointSky.read(tmp_path / "w.skymodel")
     assert (again.names, again.patches) == (sky.names, ("CasA", "CygA", "CygA"))
     np.testing.assert_array_equal(again.stokes_jy, sky.stokes_jy)
 
@@ -92,7 +92,7 @@ def test_a4_seconds_are_read_as_programs_write_them(bbs, tmp_path, ra, dec, ra_d
     sky = bbs("FORMAT = Name, Type, Ra, Dec, I", f"a, POINT, {ra}, {dec}, 1")
     np.testing.assert_allclose(np.rad2deg([sky.ra_rad[0], sky.dec_rad[0]]), [ra_deg, dec_deg], rtol=1e-13)
     write_bbs(tmp_path / "w.skymodel", sky)
-    np.testing.assert_allclose(read(tmp_path / "w.skymodel").dec_rad, sky.dec_rad, rtol=1e-15)
+    np.testing.assert_allclose(PointSky.read(tmp_path / "w.skymodel").dec_rad, sky.dec_rad, rtol=1e-15)
 
 
 @pytest.mark.parametrize("ra", ["08:13:61", "08:60:00", "08:13:1e3"])
@@ -125,7 +125,7 @@ def test_fields_with_values_that_have_no_place_here_are_named(bbs):
 def test_a_file_of_line_ends_takes_no_memory(tmp_path):
     (tmp_path / "m.skymodel").write_text("FORMAT = Name, Type, Ra, Dec, I\n" + "\n" * 600_000)
     with pytest.raises(FileError, match="600,002 lines; at most 500,000 are read"):
-        read(tmp_path / "m.skymodel")
+        PointSky.read(tmp_path / "m.skymodel")
 
 
 def test_what_cannot_be_written_whole_is_not_written(tmp_path, bbs, monkeypatch):

@@ -13,7 +13,8 @@ from astropy.io import fits
 from astropy.table import Table
 
 from instrument.errors import FileError
-from instrument.sky.readers import read
+from instrument.sky.forms import read_as
+from instrument.sky.points import PointSky
 
 FIELDS = """<FIELD name="ra" datatype="double" unit="deg"/><FIELD name="dec" datatype="double" unit="deg"/>
 <FIELD name="i" datatype="double" unit="Jy"/>"""
@@ -38,7 +39,7 @@ ROW = "<TABLEDATA><TR><TD>1</TD><TD>2</TD><TD>3</TD></TR></TABLEDATA>"
 
 def test_a_whole_votable_is_read(tmp_path):
     (tmp_path / "t.vot").write_text(votable(ROW, 'nrows="1"'))
-    assert read(tmp_path / "t.vot").stokes_jy[0, 0] == 3
+    assert PointSky.read(tmp_path / "t.vot").stokes_jy[0, 0] == 3
 
 
 def test_i1_no_votable_makes_us_open_what_it_names(tmp_path):
@@ -61,12 +62,14 @@ def test_i1_no_votable_makes_us_open_what_it_names(tmp_path):
                 f'<BINARY2><STREAM HREF="{link}" encoding="gzip"/></BINARY2>',
             ):
                 (tmp_path / "t.vot").write_text(votable(data))
-                told(lambda: read(tmp_path / "t.vot"), "its data lie elsewhere (href), which is never followed")
+                told(
+                    lambda: PointSky.read(tmp_path / "t.vot"), "its data lie elsewhere (href), which is never followed"
+                )
             (tmp_path / "t.vot").write_bytes(
                 votable(f'<BINARY><STREAM href="{link}"/></BINARY>').replace('"1.0"?', '"1.0" encoding="UTF-16"?')
                 .encode("utf-16")
             )  # fmt: skip
-            told(lambda: read(tmp_path / "t.vot"))
+            told(lambda: PointSky.read(tmp_path / "t.vot"))
     finally:
         server.shutdown()
     assert asked == []
@@ -75,20 +78,20 @@ def test_i1_no_votable_makes_us_open_what_it_names(tmp_path):
 def test_i1_entities_are_not_read(tmp_path):
     text = votable(ROW).replace("<VOTABLE", f'<!DOCTYPE x [<!ENTITY a SYSTEM "file://{tmp_path}/s">]><VOTABLE')
     (tmp_path / "t.vot").write_text(text)
-    told(lambda: read(tmp_path / "t.vot"), "an entity")
+    told(lambda: PointSky.read(tmp_path / "t.vot"), "an entity")
 
 
 def test_i5_pipes_devices_and_sparse_files_are_told_at_once(tmp_path, monkeypatch):
     os.mkfifo(tmp_path / "pipe.csv")
-    told(lambda: read(tmp_path / "pipe.csv"), "is a pipe or a device")
+    told(lambda: PointSky.read(tmp_path / "pipe.csv"), "is a pipe or a device")
     (tmp_path / "zero.csv").symlink_to("/dev/zero")
-    told(lambda: read(tmp_path / "zero.csv"), "is a pipe or a device")
+    told(lambda: PointSky.read(tmp_path / "zero.csv"), "is a pipe or a device")
     with open(tmp_path / "sparse.csv", "wb") as file:
         file.truncate(20_000_000_000)
-    told(lambda: read(tmp_path / "sparse.csv"), "has 20 GB", "200 MB")
-    monkeypatch.setattr("instrument.sky.readers.CATALOGUE_BYTES", 2_000_000)
+    told(lambda: PointSky.read(tmp_path / "sparse.csv"), "has 20 GB", "200 MB")
+    monkeypatch.setattr("instrument.sky.forms.CATALOGUE_BYTES", 2_000_000)
     (tmp_path / "bomb.csv").write_bytes(gzip.compress(bytes(3_000_000), 1))
-    told(lambda: read(tmp_path / "bomb.csv"), "unpacked", "2 MB")
+    told(lambda: PointSky.read(tmp_path / "bomb.csv"), "unpacked", "2 MB")
 
 
 def declared(tmp_path, **cards):
@@ -103,14 +106,14 @@ def declared(tmp_path, **cards):
 
 def test_i5_what_a_file_declares_is_held_against_its_size_first(tmp_path):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    told(lambda: read(declared(tmp_path, NAXIS2=10**9)), "extension 1 declares 24 GB, the file has")
-    told(lambda: read(declared(tmp_path, NAXIS1=10**9)), "t.fits")
+    told(lambda: PointSky.read(declared(tmp_path, NAXIS2=10**9)), "extension 1 declares 24 GB, the file has")
+    told(lambda: PointSky.read(declared(tmp_path, NAXIS1=10**9)), "t.fits")
     for attributes in ('nrows="1000000000"', 'nrows="99999999999999999999"'):
         (tmp_path / "t.vot").write_text(votable(ROW, attributes))
-        told(lambda: read(tmp_path / "t.vot"), "rows in a file of")
+        told(lambda: PointSky.read(tmp_path / "t.vot"), "rows in a file of")
     wide = votable(ROW).replace('name="ra" ', 'name="ra" arraysize="900000000" ')
     (tmp_path / "t.vot").write_text(wide)
-    told(lambda: read(tmp_path / "t.vot"), "its columns declare 9e+08 numbers")
+    told(lambda: PointSky.read(tmp_path / "t.vot"), "its columns declare 9e+08 numbers")
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB: nothing was allocated
 
 
@@ -140,18 +143,18 @@ GOOD = "ra_deg,dec_deg,i_jy\n"
 )
 def test_i8_broken_tables_are_one_line(tmp_path, content, words):
     (tmp_path / "t.csv").write_text(content)
-    told(lambda: read(tmp_path / "t.csv"), *words)
+    told(lambda: PointSky.read(tmp_path / "t.csv"), *words)
 
 
 def test_i8_names_that_no_file_can_have_are_one_line(tmp_path):
-    told(lambda: read("a\0b.csv"), r"a\x00b.csv")
-    told(lambda: read("x" * 300))
-    told(lambda: read("x" * 30000 + "/y"))
-    told(lambda: read("~nobody-of-that-name/x.csv"))
-    told(lambda: read(5), "is no path of a file")
-    told(lambda: read(tmp_path), "is a folder")
+    told(lambda: PointSky.read("a\0b.csv"), r"a\x00b.csv")
+    told(lambda: PointSky.read("x" * 300))
+    told(lambda: PointSky.read("x" * 30000 + "/y"))
+    told(lambda: PointSky.read("~nobody-of-that-name/x.csv"))
+    told(lambda: read_as(PointSky, 5), "is no path of a file")
+    told(lambda: PointSky.read(tmp_path), "is a folder")
     (tmp_path / "table.dat").write_text("")
-    told(lambda: read(tmp_path), "is a CASA table")
+    told(lambda: PointSky.read(tmp_path), "is a CASA table")
 
 
 SECRET = "root:$6$saltsalt$hAsHhAsHhAsH:19000:0:99999:7:::"
@@ -170,23 +173,25 @@ SECRET = "root:$6$saltsalt$hAsHhAsHhAsH:19000:0:99999:7:::"
 def test_i11_contents_of_a_file_that_is_no_sky_are_not_shown(tmp_path, content):
     for name in ("shadow", "x.csv", "x.txt"):
         (tmp_path / name).write_text(content)
-        assert "hAsH" not in told(lambda name=name: read(tmp_path / name), "none of its columns is one that a sky has")
+        assert "hAsH" not in told(
+            lambda name=name: PointSky.read(tmp_path / name), "none of its columns is one that a sky has"
+        )
     (tmp_path / "x.skymodel").write_text(content)
-    assert "hAsHhAsH" not in told(lambda: read(tmp_path / "x.skymodel"))
+    assert "hAsHhAsH" not in told(lambda: PointSky.read(tmp_path / "x.skymodel"))
 
 
 def test_i11_names_and_contents_do_not_reach_the_terminal_raw(tmp_path):
     (tmp_path / "\x1b[2J.csv").write_text("ra_deg,dec_deg,i_jy\n1,2,\x1b]0;owned\x07\n")
-    told(lambda: read(tmp_path / "\x1b[2J.csv"), r"\x1b[2J.csv, line 2", r"\x1b]0;owned\x07")
+    told(lambda: PointSky.read(tmp_path / "\x1b[2J.csv"), r"\x1b[2J.csv, line 2", r"\x1b]0;owned\x07")
     (tmp_path / "x.skymodel").write_text("FORMAT = Name, Type, Ra, Dec, I\n\x1b[31ma, DISK\x1b[0m, 1deg, 2deg, 1\n")
-    told(lambda: read(tmp_path / "x.skymodel"), r"DISK\x1b[0m")
+    told(lambda: PointSky.read(tmp_path / "x.skymodel"), r"DISK\x1b[0m")
     (tmp_path / "x.skymodel").write_text("FORMAT = Name, Type, Ra, Dec, I\n" + "s" * 900 + ", DISK, 1deg, 2deg, x\n")
-    assert "sssss" * 20 not in told(lambda: read(tmp_path / "x.skymodel"))
+    assert "sssss" * 20 not in told(lambda: PointSky.read(tmp_path / "x.skymodel"))
 
 
 def test_i8_arrays_in_a_column_that_is_read_are_told(tmp_path):
     Table({"RA": np.ones((2, 3)) * u.deg, "DEC": [1.0, 2] * u.deg, "I": [1.0, 2] * u.Jy}).write(tmp_path / "t.fits")
-    told(lambda: read(tmp_path / "t.fits"), "column 'RA' holds arrays")
+    told(lambda: PointSky.read(tmp_path / "t.fits"), "column 'RA' holds arrays")
 
 
 def test_i8_units_that_take_for_ever_are_told(tmp_path):
@@ -194,9 +199,9 @@ def test_i8_units_that_take_for_ever_are_told(tmp_path):
     hdu = fits.BinTableHDU(table)
     hdu.header["TUNIT3"] = "10**99999999 Jy"
     hdu.writeto(tmp_path / "t.fits")
-    told(lambda: read(tmp_path / "t.fits"), "'10**99999999 Jy' is no unit that is read")
+    told(lambda: PointSky.read(tmp_path / "t.fits"), "'10**99999999 Jy' is no unit that is read")
     (tmp_path / "t.vot").write_text(votable(ROW).replace('unit="Jy"', 'unit="10**99999999 Jy"'))
-    told(lambda: read(tmp_path / "t.vot"), "'10**99999999 Jy' is no unit that is read")
+    told(lambda: PointSky.read(tmp_path / "t.vot"), "'10**99999999 Jy' is no unit that is read")
 
 
 def test_other_tables_of_a_file_are_named(tmp_path):
@@ -206,5 +211,5 @@ def test_other_tables_of_a_file_are_named(tmp_path):
     other = fits.BinTableHDU(Table({"x": [1.0]}), name="NOISE")
     fits.HDUList([fits.PrimaryHDU(), other, sky, fits.ImageHDU(np.ones(3), name="MAP")]).writeto(tmp_path / "t.fits")
     with pytest.warns(match="not used: NOISE, MAP"), unused_ledger() as ledger:
-        assert len(read(tmp_path / "t.fits")) == 1
+        assert len(PointSky.read(tmp_path / "t.fits")) == 1
     assert ledger == {"t.fits": ["NOISE", "MAP"]}

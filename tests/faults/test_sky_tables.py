@@ -11,8 +11,9 @@ from astropy.table import MaskedColumn, Table
 
 from instrument.errors import FileError, InputError, InstrumentWarning, UnusedWarning, unused_ledger
 from instrument.observe.directions import LIGHT
-from instrument.sky.points import FWHM_TO_SIGMA, PointSky
-from instrument.sky.readers import Catalogue, read
+from instrument.sky.points import PointSky
+from instrument.sky.readers import Catalogue
+from instrument.sky.sources import FWHM_TO_SIGMA
 from instrument.units import Direction
 
 ARCSEC = np.deg2rad(1 / 3600)
@@ -31,7 +32,7 @@ def text(tmp_path):
 def quiet(path, **told):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InstrumentWarning)
-        return read(path, **told)
+        return PointSky.read(path, **told)
 
 
 def flux(sky, mhz, stokes=0):
@@ -92,7 +93,7 @@ def test_a1_where_only_fitted_sizes_are_there_it_is_asked(tmp_path):
 def test_a1_unmarked_sizes_are_said_to_be_taken_as_they_are(tmp_path):
     (tmp_path / "t.csv").write_text("ra_deg,dec_deg,i_jy,maj_arcsec,min_arcsec,pa_deg\n1,2,3,60,30,10\n")
     with pytest.warns(InstrumentWarning, match="taken as sizes of the sources themselves; if they hold the beam"):
-        sky = read(tmp_path / "t.csv")
+        sky = PointSky.read(tmp_path / "t.csv")
     assert sky.major_rad[0] == pytest.approx(60 * ARCSEC)
 
 
@@ -147,7 +148,7 @@ def test_a2_a_frequency_that_is_nowhere_is_asked_for(tmp_path):
 def test_a2_whatever_was_not_read_is_named(tmp_path):
     (tmp_path / "t.csv").write_text("ra_deg,dec_deg,i_jy,e_i_jy,log_curv\n1,2,3,0.1,5\n")
     with pytest.warns(UnusedWarning, match="t.csv: not used: e_i_jy, log_curv"), unused_ledger() as ledger:
-        sky = read(tmp_path / "t.csv")
+        sky = PointSky.read(tmp_path / "t.csv")
     assert ledger == {"t.csv": ["e_i_jy", "log_curv"]}
     assert sky.not_read == ("t.csv: e_i_jy, log_curv",)
     assert PointSky.join(sky, sky).select([1]).not_read == sky.not_read
@@ -307,7 +308,7 @@ SAGECAL = "P1 8 13 35.98 48 12 59.17 31.5 0 0 0 -0.5 0.1 0 0 0 0 143e6"
 def test_a9_another_programs_model_is_called_by_its_name_with_the_way_out(tmp_path, name, content, message):
     (tmp_path / name).write_bytes(content.encode("latin-1"))
     with pytest.raises(FileError, match=message) as caught:
-        read(tmp_path / name)
+        PointSky.read(tmp_path / name)
     assert "\n" not in str(caught.value)
 
 
@@ -341,7 +342,7 @@ def test_numbers_that_may_be_meant_are_no_placeholders(text):
 def test_indices_that_rise_are_asked_about(tmp_path):
     (tmp_path / "t.csv").write_text("ra_deg,dec_deg,i_jy,ref_freq_mhz,alpha\n" + "1,2,3,150,0.7\n" * 4)
     with pytest.warns(InstrumentWarning, match=r"most spectral indices are positive \(median 0.7\)"):
-        read(tmp_path / "t.csv")
+        PointSky.read(tmp_path / "t.csv")
 
 
 def test_positions_in_hours_and_in_degrees_do_not_stand_in_one_column(text):
@@ -354,4 +355,4 @@ def test_positions_in_hours_and_in_degrees_do_not_stand_in_one_column(text):
 
 def test_a_packed_catalogue_is_read(tmp_path):
     (tmp_path / "t.csv.gz").write_bytes(gzip.compress(b"ra_deg,dec_deg,i_jy\n1,2,3\n"))
-    assert len(read(tmp_path / "t.csv.gz")) == 1
+    assert len(PointSky.read(tmp_path / "t.csv.gz")) == 1

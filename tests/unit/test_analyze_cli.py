@@ -11,9 +11,9 @@ from astropy.table import QTable
 from instrument import InputError, StokesCube
 from instrument.analyze.cube_checks import check_cells, check_faraday
 from instrument.analyze.faraday.synthesis import rm_synthesis
-from instrument.analyze.power.cells import cells_of
+from instrument.analyze.power.transform import cells_of
 from instrument.cli import main
-from instrument.image.cube import Psf
+from instrument.image.psf import Psf
 from instrument.pipeline.stages.cube import CubeAnalysis
 
 FREQ = (140e6 + 1e6 * np.arange(24)) * u.Hz

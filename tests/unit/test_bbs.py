@@ -10,7 +10,6 @@ from astropy.coordinates import Angle, SkyCoord
 from instrument.errors import InstrumentWarning
 from instrument.observe.directions import LIGHT, lmn, offset
 from instrument.sky.points import PointSky
-from instrument.sky.readers import read
 from instrument.units import Direction
 
 CENTRE = Direction(np.deg2rad(123.4), np.deg2rad(48.2175))
@@ -24,7 +23,7 @@ PLACE = "08:13:36, +48.13.03"
 def bbs(tmp_path):
     def made(*lines, centre=None, name="m.skymodel"):
         (tmp_path / name).write_text("\n".join(lines) + "\n")
-        return read(tmp_path / name, centre)
+        return PointSky.read(tmp_path / name, centre)
 
     return made
 

@@ -6,7 +6,6 @@ import pytest
 from instrument.errors import FileError, InputError
 from instrument.sky.bbs import write_bbs
 from instrument.sky.points import PointSky
-from instrument.sky.readers import read
 
 FREQ = np.array([120e6, 150e6, 177e6])
 HEADER = "FORMAT = Name, Type, Ra, Dec, I"
@@ -88,7 +87,7 @@ GAUSS = f"{HEADER}, MajorAxis, MinorAxis, Orientation"
 def test_what_bbs_text_gets_wrong_is_told_with_its_line(tmp_path, lines, message):
     (tmp_path / "m.skymodel").write_text("\n".join(lines) + "\n")
     with pytest.raises(FileError, match=message) as caught:
-        read(tmp_path / "m.skymodel")
+        PointSky.read(tmp_path / "m.skymodel")
     assert str(caught.value).startswith("m.skymodel")
     assert "\n" not in str(caught.value)
 
@@ -121,7 +120,7 @@ def rich_sky(count=40, seed=5):
 def test_what_is_written_as_bbs_text_reads_back(tmp_path):
     sky = rich_sky()
     write_bbs(tmp_path / "w.skymodel", sky)
-    again = read(tmp_path / "w.skymodel")
+    again = PointSky.read(tmp_path / "w.skymodel")
     assert (again.names, again.patches) == (sky.names, sky.patches)
     # rtol: degrees and arcsec and back in float64; fluxes and terms are written with all digits
     for field in ("ra_rad", "dec_rad", "major_rad", "minor_rad", "angle_rad"):
@@ -136,7 +135,7 @@ def test_a_plain_sky_reads_back_as_it_was(tmp_path):
         names=("a", "b"), ra_rad=[0.1, 6.0], dec_rad=[-1.0, 1.0], stokes_jy=[[1, 0.5, 0.25, -1], [-2, 0, 0, 0]]
     )
     write_bbs(tmp_path / "w.skymodel", sky)
-    again = read(tmp_path / "w.skymodel")
+    again = PointSky.read(tmp_path / "w.skymodel")
     np.testing.assert_allclose(again.vectors, sky.vectors, atol=1e-15)
     assert again.with_fields(ra_rad=sky.ra_rad, dec_rad=sky.dec_rad) == sky
 

@@ -10,7 +10,7 @@ from instrument.component import Component
 from instrument.errors import InputError
 from instrument.observe.directions import LIGHT, lmn
 from instrument.sky.mocks import FIELD, FaradaySky, GridSky, MockField, RandomSky, mock_fluxes
-from instrument.sky.readers import read
+from instrument.sky.points import PointSky
 from instrument.units import Direction
 
 CENTRE = Direction(np.deg2rad(40.0), np.deg2rad(-30.0))
@@ -103,7 +103,7 @@ def test_the_slope_of_the_mock_field_scatters_as_little_as_promised():
 
 
 def test_seed_196_is_the_catalogue_that_the_package_carries():
-    made, carried = MockField().about(FIELD), read("mock_150mhz.csv")
+    made, carried = MockField().about(FIELD), PointSky.read("mock_150mhz.csv")
     # atol: the file has 6 decimals
     np.testing.assert_allclose(made.stokes_jy, carried.stokes_jy, atol=5.1e-7)
     np.testing.assert_allclose(made.vectors, carried.vectors, atol=np.deg2rad(1e-6))

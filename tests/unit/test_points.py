@@ -8,7 +8,8 @@ from astropy.coordinates import SkyCoord
 from instrument.errors import InputError
 from instrument.observe.directions import LIGHT, lmn, offset
 from instrument.observe.sampling import Sampling
-from instrument.sky.points import FWHM_TO_SIGMA, PointSky
+from instrument.sky.points import PointSky
+from instrument.sky.sources import FWHM_TO_SIGMA
 from instrument.units import Direction, unit_vectors
 
 CENTRE = Direction(np.deg2rad(123.4), np.deg2rad(48.2175))

@@ -9,7 +9,7 @@ import instrument
 from instrument.component import Component
 from instrument.errors import FileError, InputError
 from instrument.sky.points import PointSky
-from instrument.sky.readers import Catalogue, read
+from instrument.sky.readers import Catalogue
 from instrument.units import Direction
 
 CENTRE = Direction(np.deg2rad(123.4), np.deg2rad(48.2175))
@@ -20,7 +20,7 @@ ARCSEC = np.deg2rad(1 / 3600)
 def table(tmp_path):
     def made(*lines):
         (tmp_path / "t.csv").write_text("\n".join(lines) + "\n")
-        return read(tmp_path / "t.csv")
+        return PointSky.read(tmp_path / "t.csv")
 
     return made
 
@@ -32,7 +32,7 @@ def test_the_model_of_3c196_has_its_published_total(mhz, jansky):
 
 
 def test_an_axis_called_major_may_be_the_shorter_one():
-    sky = read("3c196_pandey.skymodel", CENTRE)
+    sky = PointSky.read("3c196_pandey.skymodel", CENTRE)
     assert sky.names[3] == "3C196B2"
     assert sky.major_rad[3] / ARCSEC == pytest.approx(1.456, rel=1e-12)
     assert sky.minor_rad[3] / ARCSEC == pytest.approx(2.159, rel=1e-12)
@@ -47,11 +47,11 @@ def test_every_sky_of_the_package_reads():
         "3c196_field_sagecal_143mhz.skymodel": 10,
         "mock_150mhz.csv": 4567,
     }
-    assert {name: len(read(name)) for name in sums} == sums
+    assert {name: len(PointSky.read(name)) for name in sums} == sums
 
 
 def test_the_mock_catalogue_reads_with_its_units():
-    sky = read("mock_150mhz.csv")
+    sky = PointSky.read("mock_150mhz.csv")
     assert sky.names[:2] == ("1", "2")
     assert np.rad2deg(sky.ra_rad[1]) == pytest.approx(120.396792, abs=1e-12)
     assert sky.stokes_jy[1].tolist() == [7.7, 0, 0, 0]
@@ -62,7 +62,7 @@ def test_the_mock_catalogue_reads_with_its_units():
 def test_a_file_on_disk_wins_over_one_of_the_package(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mock_150mhz.csv").write_text("ra_deg,dec_deg,i_jy\n1,2,3\n")
-    assert len(read("mock_150mhz.csv")) == 1
+    assert len(PointSky.read("mock_150mhz.csv")) == 1
 
 
 def full_table():
@@ -89,7 +89,7 @@ def full_table():
 )
 def test_tables_bring_their_units(tmp_path, name, form):
     full_table().write(tmp_path / name, format=form)
-    sky = read(tmp_path / name)
+    sky = PointSky.read(tmp_path / name)
     assert sky.names == ("a", "b")
     np.testing.assert_allclose(np.rad2deg(sky.ra_rad), [10, 20], rtol=1e-14)
     np.testing.assert_allclose(sky.dec_rad, [0.5, -0.5], rtol=1e-14)
@@ -156,10 +156,10 @@ def test_a_masked_value_is_told_with_its_row(tmp_path):
     t["Q"] = MaskedColumn([0.1, 0.2], mask=[False, True], unit="Jy")
     t.write(tmp_path / "t.fits")
     with pytest.raises(FileError, match=r"t.fits, row 2: Q is empty"):
-        read(tmp_path / "t.fits")
+        PointSky.read(tmp_path / "t.fits")
     t.write(tmp_path / "t.ecsv")
     with pytest.raises(FileError, match=r"t.ecsv, line \d+: Q is empty"):
-        read(tmp_path / "t.ecsv")
+        PointSky.read(tmp_path / "t.ecsv")
 
 
 def test_a_unit_that_contradicts_the_name_of_its_column_is_refused(tmp_path):
@@ -167,7 +167,7 @@ def test_a_unit_that_contradicts_the_name_of_its_column_is_refused(tmp_path):
     t.rename_column("RA", "ra_arcsec")
     t.write(tmp_path / "t.ecsv")
     with pytest.raises(FileError, match="column 'ra_arcsec' is in 'deg' by its unit but not by its name"):
-        read(tmp_path / "t.ecsv")
+        PointSky.read(tmp_path / "t.ecsv")
 
 
 @pytest.mark.parametrize(
@@ -182,21 +182,21 @@ def test_a_unit_that_contradicts_the_name_of_its_column_is_refused(tmp_path):
 def test_broken_files_are_told(tmp_path, name, content, message):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(FileError, match=message) as caught:
-        read(tmp_path / name)
+        PointSky.read(tmp_path / name)
     assert "\n" not in str(caught.value)
 
 
 def test_files_that_are_not_there_are_told(tmp_path):
     with pytest.raises(FileError, match=r"nor among those of the package: did you mean '3c196_pandey.skymodel'"):
-        read("3c196_pandy.skymodel")
+        PointSky.read("3c196_pandy.skymodel")
     with pytest.raises(FileError, match="is a folder; name the file in it"):
-        read(tmp_path)
+        PointSky.read(tmp_path)
 
 
 def test_a_model_replaces_the_sources_at_its_place():
-    whole = read("mock_150mhz.csv")
+    whole = PointSky.read("mock_150mhz.csv")
     sky = instrument.load("skies", "catalogue", path="mock_150mhz.csv", model="3c196_pandey.skymodel").about(CENTRE)
-    assert sky.names == read("3c196_pandey.skymodel").names + whole.names[1:]
+    assert sky.names == PointSky.read("3c196_pandey.skymodel").names + whole.names[1:]
     assert sky.patches == ("3C196",) * 4 + ("",) * 4566
     assert sky.stokes_jy[:, 0].sum() == pytest.approx(whole.stokes_jy[:, 0].sum(), abs=1e-9)
 
@@ -228,7 +228,7 @@ def test_a_catalogue_gives_orientations_from_its_phase_centre(tmp_path):
         "a, GAUSSIAN, 130deg, 50deg, 1, 60, 20, 33\n"
     )
     sky = Catalogue(path=str(tmp_path / "m.skymodel"))
-    expected = read(tmp_path / "m.skymodel", CENTRE).angle_rad[0]
+    expected = PointSky.read(tmp_path / "m.skymodel", CENTRE).angle_rad[0]
     assert sky.about(CENTRE).angle_rad[0] == expected
     assert np.rad2deg(expected) == pytest.approx(33 + 6.6 * np.sin(np.deg2rad(49)), abs=0.1)
     assert sky.about(CENTRE) is sky.about(CENTRE)
@@ -262,4 +262,4 @@ def test_a_model_with_nothing_to_replace_is_refused(tmp_path):
 
 def test_a_centre_that_is_not_a_direction_is_refused():
     with pytest.raises(InputError, match="centre = 'north' is not a direction"):
-        read("3c196_pandey.skymodel", "north")
+        PointSky.read("3c196_pandey.skymodel", "north")

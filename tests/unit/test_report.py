@@ -13,7 +13,7 @@ from matplotlib.image import imread
 from instrument import StokesCube
 from instrument.analyze.sources.leakage import Leakage
 from instrument.errors import FileError, InputError
-from instrument.image.cube import Psf
+from instrument.image.psf import Psf
 from instrument.observe.directions import offset
 from instrument.report import figures, images, style
 from instrument.report.page import (

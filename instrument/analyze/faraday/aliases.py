@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from instrument.units import Float, Int
-
-if TYPE_CHECKING:
-    from instrument.analyze.faraday.cube import FaradayCube
+from instrument.units import Float
 
 CHUNK_BYTES = 32 << 20
 MOST = 200_000  # steps of FWHM / 8 in which aliases are looked for
@@ -41,26 +38,25 @@ def summits(lambda2: Float, weights: Float, span: float, fwhm: float) -> tuple[F
     return depth, height
 
 
-def sidelobe(cube: FaradayCube, use: Int, span: float, sides: Float) -> Float:
+def sidelobe(lambda2: Float, weights: Float, flags: Any, fwhm: float, span: float, sides: Float) -> Float:
     """Height of the highest peak of |R| beside the main one (n,) that lies in the axis, of some pixels (n,).
 
-    `sides` (n,) is how far each pixel's axis goes on from its peak. Pixels with voxels of their own missing have RMSFs
-    of their own: theirs is looked for in the whole span.
+    `sides` (n,) is how far each pixel's axis goes on from its peak; `flags` are the bits (F / 8, n) of their voxels.
+    Pixels with voxels of their own missing have RMSFs of their own: theirs is looked for in the whole span.
     """
-    weights = cube.weights
     channels = np.flatnonzero(weights > 0)
-    x, w = cube.lambda2[channels], weights[channels]
-    depth, height = summits(x, w, span, cube.fwhm)
+    x, w = lambda2[channels], weights[channels]
+    depth, height = summits(x, w, span, fwhm)
     order = np.argsort(depth)
     highest = np.append(0.0, np.maximum.accumulate(height[order]))
     out = highest[np.searchsorted(depth[order], sides, "right")]
-    if cube.flags is None or not len(use):
+    if flags is None or not len(sides):
         return np.minimum(out, 1.0)
-    some = np.flatnonzero(cube.flags[:, use].any(axis=0))
-    patterns, place = np.unique(cube.flags[:, use[some]], axis=1, return_inverse=True)
+    some = np.flatnonzero(flags.any(axis=0))
+    patterns, place = np.unique(flags[:, some], axis=1, return_inverse=True)
     there = np.unpackbits(patterns, axis=0, count=len(weights))[channels].T == 0
     found = np.empty(len(there))
-    phi = _axis(span, cube.fwhm)
+    phi = _axis(span, fwhm)
     size = max(1, CHUNK_BYTES // (8 * max(len(phi), len(x))))
     for first in range(0, len(there), size):
         found[first : first + size] = _highest(x, there[first : first + size] * w, phi)

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
+from instrument.analyze.faraday.aliases import summits
 from instrument.analyze.power.fourier import comoving, line_of_sight
 from instrument.checked import checked
 from instrument.compiled import compiled
@@ -174,8 +175,6 @@ class FaradayBand:
 
     def aliases(self, span: float, least: float = 0.5) -> tuple[tuple[float, float], ...]:
         """Depths within `span` at which |R| comes back to `least` or more, and how high, highest first (20 at most)."""
-        from instrument.analyze.faraday.aliases import summits
-
         depth, height = summits(self.lambda2, self.weights, span, self.fwhm)
         high = [k for k in np.argsort(-height, kind="stable") if height[k] >= least][:20]
         return tuple((float(depth[k]), float(min(height[k], 1.0))) for k in high)

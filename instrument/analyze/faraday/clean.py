@@ -7,19 +7,20 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from instrument.analyze.faraday.band import half_height, one
 from instrument.analyze.faraday.chunks import in_threads
-from instrument.analyze.faraday.cube import FaradayCube
+from instrument.analyze.faraday.spectra import FaradaySpectra
 from instrument.compiled import compiled
 from instrument.errors import InputError, InstrumentError, Outcome
 from instrument.phasor import FAST
 from instrument.shown import short_repr
 from instrument.units import Complex, Float, Int
 
+C = TypeVar("C", bound=FaradaySpectra)
 OUTCOMES = (Outcome.CONVERGED, Outcome.ITERATION_LIMIT, Outcome.NON_FINITE)
 BLOCK = 32  # spectra side by side: rows of 256 bytes are read and written, a column alone costs a page each value
 LANES = 64  # spectra are padded to a multiple of it, so that vector loops have no tail
@@ -27,7 +28,7 @@ CHUNK_BYTES = 64 << 20  # of tables, where every pixel has flags of its own: 72 
 
 
 @dataclass(frozen=True, eq=False)
-class FaradayClean:
+class FaradayClean(Generic[C]):
     """What RM-CLEAN made of a Faraday cube, complex (N, Ny, Nx) each: components, residual and restored.
 
     Högbom's algorithm along Faraday depth (Heald, Braun & Edmonds 2009): the largest |F| times the gain becomes a
@@ -39,7 +40,7 @@ class FaradayClean:
     """
 
     __repr__ = short_repr
-    dirty: FaradayCube
+    dirty: C
     components: Complex
     residual: Complex
     restored: Complex
@@ -65,7 +66,7 @@ class FaradayClean:
         return self.codes == 0
 
     @property
-    def cube(self) -> FaradayCube:
+    def cube(self) -> C:
         """The restored spectra as a `FaradayCube`, for peaks and files."""
         return replace(self.dirty, data=self.restored)
 
@@ -174,13 +175,13 @@ def _clean(
 
 
 def rm_clean(
-    cube: FaradayCube,
+    cube: C,
     cutoff: Any,
     sigmas: float | None,
     gain: float,
     iterations: int,
     progress: Callable[[float], None] | None,
-) -> FaradayClean:
+) -> FaradayClean[C]:
     """Clean every spectrum of a cube; see `FaradayCube.clean`."""
     n, depths = len(cube.depths), cube.depths
     step = (depths[-1] - depths[0]) / max(1, n - 1)
@@ -242,7 +243,7 @@ def rm_clean(
 class _Tables:
     """R and the restoring beam at the 2N - 1 differences of depths, for every set of channels that pixels have."""
 
-    def __init__(self, cube: FaradayCube, step: float, n: int, padding: int, real: Any) -> None:
+    def __init__(self, cube: FaradaySpectra, step: float, n: int, padding: int, real: Any) -> None:
         self.cube, self.real, self.use, self.padding = cube, real, cube.weights > 0, padding
         self.lambda2, self.weights = cube.lambda2[self.use], cube.weights[self.use]
         self.depths = step * np.arange(n)

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from instrument.analyze.faraday.spectra import FaradaySpectra
 from instrument.observe.grid import ImageGrid
 from instrument.provenance import fits_cards
 from instrument.whole_file import whole_file
 
-if TYPE_CHECKING:
-    from instrument.analyze.faraday.cube import FaradayCube
 
-
-def sky_header(cube: FaradayCube) -> Any:
+def sky_header(cube: FaradaySpectra) -> Any:
     """FITS header of the first two axes, RA and DEC, SIN projection about the centre pixel."""
     from astropy.io import fits
 
@@ -28,7 +26,7 @@ def sky_header(cube: FaradayCube) -> Any:
     return header
 
 
-def write_faraday(cube: FaradayCube, path: str | os.PathLike[str], overwrite: bool = False) -> None:
+def write_faraday(cube: FaradaySpectra, path: str | os.PathLike[str], overwrite: bool = False) -> None:
     """Write a cube; see `FaradayCube.write`."""
     from astropy.io import fits
 

@@ -11,8 +11,9 @@ import numpy as np
 from instrument.analyze.faraday.aliases import sidelobe
 from instrument.analyze.faraday.band import number, one
 from instrument.analyze.faraday.chunks import in_threads
-from instrument.analyze.faraday.cube import FaradayCube
+from instrument.analyze.faraday.file import sky_header
 from instrument.analyze.faraday.kernels import brightest, summit
+from instrument.analyze.faraday.spectra import FaradaySpectra
 from instrument.errors import InputError
 from instrument.provenance import fits_cards
 from instrument.shown import short_repr
@@ -61,11 +62,9 @@ class FaradayPeaks:
     lambda2_0: float
     snr_min: float
 
-    def write(self, path: str | os.PathLike[str], cube: FaradayCube, overwrite: bool = False) -> None:
+    def write(self, path: str | os.PathLike[str], cube: FaradaySpectra, overwrite: bool = False) -> None:
         """Write the maps as images of a FITS file, with the coordinates of the cube; whole or not there."""
         from astropy.io import fits
-
-        from instrument.analyze.faraday.file import sky_header
 
         units = {"depth": "rad/m2", "depth_error": "rad/m2", "snr": "", "significant": "", "edge": "", "ambiguous": ""}
         hdus: list[Any] = [fits.PrimaryHDU(header=fits.Header(fits_cards()))]
@@ -79,7 +78,7 @@ class FaradayPeaks:
             fits.HDUList(hdus).writeto(partial, overwrite=True)
 
 
-def find_peaks(cube: FaradayCube, snr: float, noise: Any) -> FaradayPeaks:
+def find_peaks(cube: FaradaySpectra, snr: float, noise: Any) -> FaradayPeaks:
     """Peaks of every pixel of a cube of Q + iU; see `FaradayCube.peaks`."""
     if cube.stokes != "P":
         raise InputError(f"peaks are those of Q + iU, this is Stokes {cube.stokes}: rm_synthesis(depths, stokes='P')")
@@ -115,7 +114,8 @@ def find_peaks(cube: FaradayCube, snr: float, noise: Any) -> FaradayPeaks:
     found = band.errors(use, top, level[use])
     span = float(phi[-1] - phi[0])
     sides = np.maximum(depth - phi[0], phi[-1] - depth)
-    beside = sidelobe(cube, use, span, sides)
+    flags = None if cube.flags is None else cube.flags[:, use]
+    beside = sidelobe(cube.lambda2, cube.weights, flags, cube.fwhm, span, sides)
     clear = top / level[use] * np.sqrt((1 - beside) / 2) >= min(SURE, threshold * np.sqrt((1 - FAINT) / 2))
     ambiguous = np.zeros(pixels, bool)
     ambiguous[use[~clear]] = True
@@ -150,7 +150,7 @@ def find_peaks(cube: FaradayCube, snr: float, noise: Any) -> FaradayPeaks:
     )
 
 
-def _noise(cube: FaradayCube, noise: Any) -> Float:
+def _noise(cube: FaradaySpectra, noise: Any) -> Float:
     """Noise of every pixel (Ny, Nx), that given or that of the cube."""
     if noise is None:
         return cube.noise_map()
@@ -180,7 +180,7 @@ def _pieces(phi: Float, fwhm: float) -> Int:
 class _Channels:
     """Weighted moments of lambda² of the channels that pixels have, and the errors that follow from them."""
 
-    def __init__(self, cube: FaradayCube) -> None:
+    def __init__(self, cube: FaradaySpectra) -> None:
         self.cube, self.w = cube, cube.weights
         self.mean = float(self.w @ cube.lambda2 / self.w.sum())
         x, sigma = cube.lambda2 - self.mean, cube.channel_noise

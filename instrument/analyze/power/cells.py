@@ -1,77 +1,24 @@
-"""Fourier cells of a cube: power over cells (u, v) and delays, in double precision and bounded blocks."""
+"""Cells: the Fourier cells of a cube, and their spectra in bins of k_perp and k_par, or of k."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from instrument.analyze.power.channel_grid import even_channels, infill_operator, same_grid
-from instrument.analyze.power.fourier import (
-    Stokes,
-    Taper,
-    check_redshift,
-    check_stokes,
-    comoving,
-    line_of_sight,
-    taper_of,
-    uv_limits,
-)
+from instrument.analyze.power.bins import Frame, Plane
+from instrument.analyze.power.cylinders import Cylindrical, Spherical, bounds_of, divided, length, rows_of
+from instrument.analyze.power.fourier import bin_edges, per_mpc, sine
 from instrument.analyze.power.modes import Modes
-from instrument.errors import InputError, warn
-from instrument.image.cube import StokesCube
-from instrument.numbers import LARGEST, squarable
-from instrument.units import Bool, Complex, Float, Int, one_si
-
-if TYPE_CHECKING:
-    from instrument.analyze.power.cylinders import Cylindrical, Spherical
-
-BLOCK = 8  # channels transformed at once: 8 images of 480 x 480 are 15 MB
-COLUMNS = 512  # cells transformed along frequency at once: 1.3 MB of 161 channels stay in the cache
-WEAK = 0.05  # of the largest response of a PSF: cells below it are not divided by it, but left out
-
-
-@dataclass(frozen=True)
-class Frame:
-    """What a cube's cells mean in space: redshift, distances in Mpc, and what was done before the transform."""
-
-    unit: str
-    stokes: str
-    freq_hz: float  # middle of the band
-    redshift: float  # one for the whole band
-    distance_mpc: float  # transverse comoving: k_perp = 2 pi uv / distance
-    depth_mpc_per_hz: float  # along the line of sight: k_par = 2 pi delay / depth
-    taper: str | None
-    taper_space: str | None
-    uv_range: tuple[float, float] | None  # wavelengths
-    missing: float  # share of the lines of sight with NaN, which count as zero
-    infilled: int  # channels without data that were filled in
-    psf_corrected: bool
-
-    @property
-    def horizon_slope(self) -> float:
-        """k_par / k_perp of the horizon, D H(z) / (c (1+z)): 3.59 at 150 MHz; of an angle, its sine times that."""
-        return self.distance_mpc / (self.freq_hz * self.depth_mpc_per_hz)
+from instrument.errors import InputError
+from instrument.units import FINITE, Float
 
 
 @dataclass(frozen=True, eq=False)
-class Cells:
-    """Power (M, N) in `unit`² Mpc³ of N cells (u, v), by |u|, and M delays from 0 to Nyquist, both signs averaged.
+class Cells(Plane):
+    """Cells with what makes them alike, from which spectra are made."""
 
-    A cell stands for `times` (N,) cells of the plane and a delay for `folds` (M,); N by M is what a cube has. `auto` is
-    the geometric mean of the two powers where `power` is that of one cube across another, and the same without.
-    """
-
-    frame: Frame
-    k_perp: Float  # (N,), 1/Mpc, growing
-    k_par: Float  # (M,), 1/Mpc, growing from 0
-    power: Float
-    auto: Float
-    times: Float
-    folds: Float
-    v_index: Int  # (N,), place on the grid of the DFT of each cell, rows and columns
-    u_index: Int
     modes: Modes  # which cells are alike: behind a taper, or of both signs
     left_out: dict[str, int]
 
@@ -79,260 +26,130 @@ class Cells:
         self, bins: Any = 15, bins_par: Any = None, log: bool = True, paper_axis: bool = False
     ) -> Cylindrical:
         """Spectrum in bins of k_perp and k_par; see `Analyzer.cylindrical`."""
-        from instrument.analyze.power.cylinders import cylindrical
-
         return cylindrical(self, bins, bins_par, log, paper_axis)
 
     def spherical(self, bins: Any = 15, log: bool = True, wedge: Any = None, k_par_min: Any = None) -> Spherical:
         """Spectrum in bins of k; see `Analyzer.spherical`."""
-        from instrument.analyze.power.cylinders import spherical
-
         return spherical(self, bins, log, wedge, k_par_min)
 
-    def sums(self, bounds: Int, row: Float) -> Float:
-        """Sums (P,) over cells bounds[i] <= n < bounds[i+1] of one row (N,), weighted by `times`."""
-        filled = np.diff(bounds) > 0
-        out = np.zeros(len(bounds) - 1)
-        # differences of a running sum would bury a faint bin behind a bright one
-        if filled.any():
-            part = slice(bounds[0], bounds[-1])
-            out[filled] = np.add.reduceat(row[part] * self.times[part], bounds[:-1][filled] - bounds[0])
-        return out
 
-
-def cells_of(
-    cube: StokesCube,
-    stokes: Stokes = "I",
-    taper: Taper | None = "blackman-harris",
-    taper_space: Taper | None = None,
-    uv_range: tuple[float, float] | None = None,
-    cross: StokesCube | None = None,
-    psf_corrected: bool = False,
-    infill: Any = None,
-    redshift: float | None = None,
-    cosmology: Any = None,
-) -> Cells:
-    """Cells of a cube, or of one cube across another (the real part); see `Analyzer.cylindrical`.
-
-    P = V / N² |DFT(w x)|² / mean w² (V the comoving volume, N the voxels): its sum over all cells over V is the
-    variance (Parseval). Raises `InputError` for cubes that have no such spectrum.
-    """
-    check_stokes(stokes)
-    infill = None if infill is None else one_si(infill, "s", "infill", above=0)
-    order, grid_hz, here = even_channels(cube, infill is not None)
-    freq = float((grid_hz[0] + grid_hz[-1]) / 2)
-    redshift = check_redshift(redshift, float(grid_hz[0]), float(grid_hz[-1]))
-    z, distance = comoving(freq, redshift, cosmology)
-    depth = line_of_sight(z, cosmology)
-    ny, nx = cube.data.shape[2:]
-    cubes = [cube] if cross is None else [cube, same_grid(cube, cross)]
-    masks = [_mask(c, stokes, order, infill is not None) for c in cubes]
-    has, seen = (np.logical_and.reduce([m[k] for m in masks]) for k in (0, 1))
-    sums = [m[2] for m in masks]
-    here = here.copy()
-    here[here] = seen
-    window = has * np.multiply.outer(taper_of(ny, taper_space), taper_of(nx, taper_space))
-    if not window.any():
-        raise InputError(f"{stokes} has no data: every pixel is NaN in some channel, or where the taper is not 0")
-    if not has.all():
-        text = f"{1 - has.mean():.2g} of the lines of sight hold NaN and count as zero: rims of holes scatter power"
-        warn(text)
-    v, u = np.fft.fftfreq(ny, cube.pixel_rad), np.fft.fftfreq(nx, cube.pixel_rad)
-    half = stokes != "P"  # of a real image half the plane is made
-    low, high = uv_limits(uv_range)
-    columns = np.flatnonzero(np.abs(u[: nx // 2 + 1] if half else u) <= high)
-    uv = np.hypot(v[:, None], u[columns])
-    times = np.broadcast_to((_both_signs(nx) if half else np.ones(nx))[columns], uv.shape)
-    (use,) = np.nonzero(((uv >= low) & (uv <= high)).ravel())
-    if not use.size:
-        raise InputError(f"uv_range = {uv_range} holds no cell of an image of {nx} x {ny}")
-    left_out: dict[str, int] = {}
-    along = taper_of(len(grid_hz), taper)
-    spectra, response = [], None
-    if psf_corrected:
-        response = _response(cube, order[seen], columns, use)
-        strong = response.min(axis=0) >= WEAK * response.max()
-        left_out["cells where the PSF is weak"] = int((~strong).sum())
-        use, response = use[strong], response[:, strong]
-    for c, total in zip(cubes, sums, strict=True):
-        found = _transform(c, stokes, order[seen], window, has, total[seen], columns, use)
-        if response is not None:
-            found /= response
-        if not here.all():
-            some, found = found, np.empty((len(grid_hz), use.size), complex)
-            found[here], found[~here] = some, infill_operator(grid_hz, here, infill) @ some
-        spectra.append(found)
-    n = len(grid_hz)
-    square = float((window**2).mean() * (along**2).mean())
-    # V / N^2 = cell / N: the volume of a voxel over their number
-    scale = (distance * cube.pixel_rad) ** 2 * depth * (grid_hz[1] - grid_hz[0]) / (n * ny * nx * square)
-    folds = _both_signs(n)
-    power, auto = _delays(spectra, along, folds, scale)
-    if not 1 / LARGEST**2 < float(auto.max()) < LARGEST**2:  # only then is it worth to look at all voxels
-        squarable(max(_size(c, stokes) for c in cubes), stokes)
-    frame = Frame(
-        cube.unit, stokes, freq, z, distance, depth, taper, taper_space, uv_range and (low, high),
-        1 - float(has.mean()), int((~here).sum()), psf_corrected,
-    )  # fmt: skip
-    k_par = 2 * np.pi * np.arange(len(folds)) / (n * (grid_hz[1] - grid_hz[0]) * depth)
-    rising = np.argsort(uv.ravel()[use], kind="stable")
-    for values in (power,) if auto is power else (power, auto):
-        for row in values:  # in place: a second array costs 25 ms to page in
-            row[:] = row[rising]
-    use = use[rising]
-    k_perp = uv.ravel()[use] * 2 * np.pi / distance
-    row, column = np.divmod(use, len(columns))
-    step = *(2 * np.pi / (distance * n * cube.pixel_rad) for n in (ny, nx)), float(k_par[1])
-    places = times.ravel()[use], folds, row, columns[column]
-    return Cells(frame, k_perp, k_par, power, auto, *places, Modes(window, along, step, half), left_out)
-
-
-def _both_signs(n: int) -> Float:
-    """How many of n cells each of the n // 2 + 1 from 0 to Nyquist stands for (both signs)."""
-    times = np.full(n // 2 + 1, 2.0)
-    times[[0] if n % 2 else [0, -1]] = 1
-    return times
-
-
-def _work(cube: StokesCube, stokes: str, number: int) -> Float | Complex:
-    """Room for so many images in double precision (C, Ny, Nx); complex for "P"."""
-    return np.empty((number, *cube.data.shape[2:]), complex if stokes == "P" else float)
-
-
-def _plane(cube: StokesCube, stokes: str, channel: int, out: Float | Complex) -> None:
-    """Put the image of a channel (Ny, Nx) into `out`."""
-    if stokes == "P":
-        out.real, out.imag = cube.data[channel, 1], cube.data[channel, 2]
+def cylindrical(
+    cells: Cells, bins: Any = 15, bins_par: Any = None, log: bool = True, paper_axis: bool = False
+) -> Cylindrical:
+    """Cells in bins of k_perp and k_par; see `Analyzer.cylindrical`."""
+    if paper_axis:
+        cells = _mirrored(cells)
+    perp = _edges(cells.k_perp, bins, log, cells.frame)
+    if bins_par is None:
+        # every delay is a bin: edges half-way between
+        step = cells.k_par[1]
+        par = step * (np.arange(len(cells.k_par) + (not log)) + (0.5 if log else -0.5))
     else:
-        out[:] = cube.data[channel, "IQUV".index(stokes)]
+        par = _edges(cells.k_par, bins_par, log)
+    bounds, rows = bounds_of(cells.k_perp, perp), rows_of(cells.k_par, par)
+    shape = len(perp) - 1, len(par) - 1
+    weight, sums, both = (np.zeros(shape) for _ in range(3))
+    each = cells.sums(bounds, np.ones(len(cells.k_perp)))
+    for row, fold, power, auto in zip(rows, cells.folds, cells.power, cells.auto, strict=True):
+        if row >= 0:
+            weight[:, row] += fold * each
+            found = cells.sums(bounds, power)
+            sums[:, row] += fold * found
+            both[:, row] += fold * (found if cells.auto is cells.power else cells.sums(bounds, auto))
+    count = weight.round().astype(int)
+    power = divided(sums, count)
+    folds = np.bincount(rows[rows >= 0], cells.folds[rows >= 0], shape[1])
+    k_par = np.bincount(rows[rows >= 0], (cells.folds * cells.k_par)[rows >= 0], shape[1])
+    plane, alone = cells.times.sum(), 0.0 if bounds[0] == 0 else cells.times[cells.k_perp <= 0].sum()
+    flat = 0.0 if rows[0] >= 0 else cells.folds[0] * (plane - alone)
+    left_out = dict(cells.left_out) | {"k_perp = 0": round(alone * cells.folds.sum()), "k_par = 0": round(flat)}
+    left_out["outside all bins"] = round(plane * cells.folds.sum() - alone * cells.folds.sum() - flat - weight.sum())
+    return Cylindrical(
+        divided(cells.sums(bounds, cells.k_perp), each),
+        divided(k_par, folds),
+        power,
+        _sigma(power, divided(both, count), cells.modes.cylindrical(cells, perp, bounds, rows, shape[1])),
+        count,
+        perp,
+        par,
+        cells.frame,
+        left_out,
+        cells,
+    )
 
 
-def _size(cube: StokesCube, stokes: str) -> float:
-    """Largest |value| of a Stokes parameter, or of Q and U."""
-    values = cube.data[:, 1:3] if stokes == "P" else cube.data[:, "IQUV".index(stokes)]
-    return max(float(np.fmax.reduce(np.abs(plane), axis=None)) for plane in values)  # one channel held at a time
+def spherical(cells: Cells, bins: Any = 15, log: bool = True, wedge: Any = None, k_par_min: Any = None) -> Spherical:
+    """Cells in bins of k, those of the wedge or of small k_par left out where asked; see `Analyzer.spherical`."""
+    slope = cells.frame.horizon_slope * sine(wedge)
+    least = FINITE.check(float(per_mpc(0.0 if k_par_min is None else k_par_min, "k_par_min")), "k_par_min")
+    if not 0 <= least < cells.k_par[-1]:
+        raise InputError(f"k_par_min = {k_par_min} is not within 0 to {cells.k_par[-1]:.3g} /Mpc")
+    # of every delay, the cells (u, v) that are above the wedge: the first so many
+    ends = np.where(cells.k_par < least, 0, np.searchsorted(cells.k_perp * slope, cells.k_par, "right"))
+    first = cells.k_perp[: np.searchsorted(cells.k_perp, 0.0, "right") + 1]
+    k = length(first, cells.k_par[ends > 0][:, None])
+    lowest = float(k[k > 0].min(initial=np.inf))
+    highest = float(length(cells.k_perp[-1], cells.k_par[-1]))
+    edges = bin_edges(lowest, highest, bins, log)
+    shape = len(edges) - 1
+    weight, sums, both, k_sum = (np.zeros(shape) for _ in range(4))
+    bounds = np.zeros((len(cells.k_par), shape + 1), int)
+    upto = np.append(0.0, np.cumsum(cells.times))  # whole numbers: differences are exact
+    in_wedge = 0.0
+    for m, (k_par, fold, end) in enumerate(zip(cells.k_par, cells.folds, ends, strict=True)):
+        k = length(cells.k_perp, k_par)
+        cut = bounds_of(k, edges)
+        if k_par == 0 and edges[0] == 0:
+            cut = np.maximum(cut, np.searchsorted(k, 0.0, "right"))  # k = 0 is the mean
+        bounds[m] = cut = np.minimum(cut, end)
+        weight += fold * np.diff(upto[cut])
+        k_sum += fold * cells.sums(cut, k)
+        found = cells.sums(cut, cells.power[m])
+        sums += fold * found
+        both += fold * (found if cells.auto is cells.power else cells.sums(cut, cells.auto[m]))
+        in_wedge += fold * (upto[-1] - upto[end])
+    count = weight.round().astype(int)
+    power = divided(sums, count)
+    left_out = dict(cells.left_out)
+    if wedge is not None or k_par_min is not None:
+        left_out["in the wedge, or below k_par_min"] = round(in_wedge)
+    left_out["k = 0, or outside all bins"] = round(cells.folds.sum() * upto[-1] - in_wedge - weight.sum())
+    sigma = _sigma(power, divided(both, count), cells.modes.spherical(cells, edges, bounds, slope, least))
+    return Spherical(divided(k_sum, count), power, sigma, count, edges, cells.frame, left_out, cells, bounds)
 
 
-def _mask(cube: StokesCube, stokes: str, order: Int, infill: bool) -> tuple[Bool, Bool, Float | Complex]:
-    """Pixels with data in every channel that has any (Ny, Nx), and in order (F,) those channels and all sums."""
-    has = np.ones(cube.data.shape[2:], bool)
-    seen = np.ones(len(order), bool)
-    image = _work(cube, stokes, 1)[0]
-    sums = np.empty(len(order), image.dtype)
-    for k, channel in enumerate(order):
-        # the sum of an image is finite unless a voxel is not: most channels are read once only
-        _plane(cube, stokes, channel, image)
-        sums[k] = image.sum()
-        if np.isfinite(sums[k]):
-            continue
-        if np.isinf(image).any():
-            raise InputError(
-                f"{stokes} of channel {channel} has {np.isinf(image).sum()} infinite pixels: make them NaN"
-            )
-        good = ~np.isnan(image)
-        seen[k] = good.any()
-        has &= good | ~seen[k]
-    if not seen.any():
-        raise InputError(f"{stokes} has no data: all NaN")
-    if not seen.all() and not infill:
-        where = ", ".join(str(c) for c in order[~seen][:5]) + (", ..." if (~seen).sum() > 5 else "")
-        raise InputError(
-            f"{(~seen).sum()} channels are all NaN ({where}): fill them in with infill=300 * u.ns, or leave them out"
-        )
-    return has, seen, sums
+def _edges(k: Float, bins: Any, log: bool, frame: Frame | None = None) -> Float:
+    """Edges over the range of k, or of the cut of baselines; from the first k above 0 in log bins."""
+    above = k[k > 0]
+    if not above.size:
+        raise InputError("an image of one pixel has no k_perp above 0: there is nothing to bin")
+    low, high = float(above.min()) if log else float(k.min()), float(k.max())
+    if frame is not None and frame.uv_range is not None:
+        per_mpc = 2 * np.pi / frame.distance_mpc
+        low = frame.uv_range[0] * per_mpc if frame.uv_range[0] > 0 else low
+        high = frame.uv_range[1] * per_mpc if np.isfinite(frame.uv_range[1]) else high
+    return bin_edges(low, high, bins, log)
 
 
-def _transform(
-    cube: StokesCube,
-    stokes: str,
-    channels: Int,
-    window: Float,
-    has: Bool,
-    sums: Float | Complex,
-    columns: Int,
-    use: Int,
-) -> Complex:
-    """Cells `use` among columns of the DFT of each image behind the window, the mean of the cube taken off (C, N).
-
-    `sums` of the images are those of all pixels, used where no line of sight is left out.
-    """
-    work = _work(cube, stokes, min(BLOCK, len(channels)))
-    whole, flat = has.all(), (window == 1).all()
-    if not whole:
-        sums = np.empty_like(sums)
-        for k, channel in enumerate(channels):
-            _plane(cube, stokes, channel, work[0])
-            sums[k] = work[0][has].sum()
-    mean = sums.sum() / (len(channels) * has.sum())
-    out = np.empty((len(channels), use.size), complex)
-    for a in range(0, len(channels), BLOCK):
-        part = work[: len(channels) - a]
-        for channel, image in zip(channels[a : a + BLOCK], part, strict=True):
-            _plane(cube, stokes, channel, image)
-            image -= mean
-            if not flat:
-                image *= window
-            if not whole:
-                image[~has] = 0.0  # 0 times NaN is NaN
-        into = out[a : a + BLOCK]
-        if use.size == len(window) * len(columns):
-            _columns_of(part, columns, into.reshape(len(part), len(window), -1))
-        else:
-            np.take(_columns_of(part, columns).reshape(len(part), -1), use, axis=1, out=into, mode="clip")
-    return out
+def _sigma(power: Float, auto: Float, modes: Float) -> Float:
+    """Scatter of a Gaussian field: power over the root of the modes; across two cubes, from all three powers."""
+    size = power if auto is power else np.sqrt((power**2 + auto**2) / 2)
+    return divided(size, np.sqrt(modes))
 
 
-def _columns_of(images: Float | Complex, columns: Int, out: Complex | None = None) -> Complex:
-    """Some columns of the DFT over the last two axes (..., Ny, C): rows first, then only what is asked for."""
-    from ducc0 import fft
-
-    rows = fft.c2c if np.iscomplexobj(images) else fft.r2c
-    first: Any = rows(images, axes=(images.ndim - 1,), nthreads=0)
-    if len(columns) < first.shape[-1]:
-        first = first[..., columns]
-    return np.asarray(fft.c2c(first, axes=(images.ndim - 2,), out=first if out is None else out, nthreads=0))
-
-
-def _delays(spectra: list[Complex], along: Float, folds: Float, scale: float) -> tuple[Float, Float]:
-    """Power of delays 0 to Nyquist (M, N), mean over both signs, across and by itself."""
-    from ducc0 import fft
-
-    n, m, size = len(along), len(folds), spectra[0].shape[1]
-    power = np.empty((m, size))
-    auto = power if len(spectra) == 1 else np.empty((m, size))
-    for a in range(0, size, COLUMNS):
-        block = slice(a, a + COLUMNS)
-        parts = [s[:, block] * along[:, None] for s in spectra]  # (n, cells)
-        for part in parts:
-            fft.c2c(part, axes=(0,), nthreads=0, out=part)
-        squares = [p.real**2 + p.imag**2 for p in parts]
-        power[:, block] = _folded(_across(parts) if len(parts) == 2 else squares[0], n, m) * scale
-        if len(parts) == 2:
-            auto[:, block] = np.sqrt(_folded(squares[0], n, m) * _folded(squares[1], n, m)) * scale
-    return power, auto
-
-
-def _across(parts: list[Complex]) -> Float:
-    one, two = parts
-    return one.real * two.real + one.imag * two.imag
-
-
-def _folded(square: Float, n: int, m: int) -> Float:
-    """Mean of delays +k and -k, k = 0 to Nyquist."""
-    out = square[:m].copy()
-    inner = slice(1, (n - 1) // 2 + 1)
-    out[inner] = (out[inner] + square[: n // 2 : -1]) / 2
-    return out
-
-
-def _response(cube: StokesCube, channels: Int, columns: Int, use: Int) -> Float:
-    """What the PSF makes of each cell, |DFT(PSF)| pixel² / solid angle (C, N); 1 at 0 for a Gaussian PSF."""
-    if cube.psf is None or cube.psf.data is None:
-        raise InputError("psf_corrected needs the images of the PSF: give a cube that an Imager has made")
-    out = np.empty((len(channels), use.size))
-    for k, channel in enumerate(channels):
-        psf = np.asarray(cube.psf.data[channel], complex)
-        if psf.shape != cube.data.shape[2:] or not np.isfinite(psf).all():
-            raise InputError(f"the PSF of channel {channel} is {psf.shape} or not finite: it must be like the image")
-        out[k] = np.abs(_columns_of(psf, columns)).ravel()[use] * cube.pixel_rad**2 / cube.psf.solid_angle_sr[channel]
-    return out
+def _mirrored(cells: Cells) -> Cells:
+    """Delays up to 1/dnu as printed in the paper: what is beyond Nyquist, 1/(2 dnu), is its mirror image."""
+    m = len(cells.k_par)
+    n = round(float(cells.folds.sum()))
+    back = np.arange(n)
+    back = np.minimum(back, n - back)
+    assert back.max() == m - 1
+    auto = cells.auto[back] if cells.auto is not cells.power else None
+    power = cells.power[back]
+    return replace(
+        cells,
+        k_par=cells.k_par[1] * np.arange(n),
+        power=power,
+        auto=power if auto is None else auto,
+        folds=np.ones(n),
+    )

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from instrument.analyze.power.bins import Plane
 from instrument.units import Float, Int
-
-if TYPE_CHECKING:
-    from instrument.analyze.power.cells import Cells
 
 NEAR = 6  # cells: the square of a four-term taper reaches no further
 LEAST = 1e-4  # of the correlation of a cell with itself: what is less counts with the far ones
@@ -77,7 +75,7 @@ class Modes:
     step: tuple[float, float, float]
     real: bool
 
-    def cylindrical(self, cells: Cells, perp: Float, bounds: Int, rows: Int, bins_par: int) -> Float:
+    def cylindrical(self, cells: Plane, perp: Float, bounds: Int, rows: Int, bins_par: int) -> Float:
         """Modes (P, L) of bins of k_perp (edges, and where they begin among the cells) and of delays (their bins)."""
         low, high = cells.k_perp[0] * (1 - 1e-9), cells.k_perp[-1] * SLACK**2
         parts = []
@@ -103,7 +101,7 @@ class Modes:
         )  # fmt: skip
         return np.multiply.outer(plane, line) / (2 if self.real else 1)
 
-    def spherical(self, cells: Cells, edges: Float, bounds: Int, slope: float, least: float) -> Float:
+    def spherical(self, cells: Plane, edges: Float, bounds: Int, slope: float, least: float) -> Float:
         """Modes (N,) of bins of k; `bounds` (M, N + 1) are where they begin among the cells of each delay."""
         low, high = cells.k_perp[0] * (1 - 1e-9), cells.k_perp[-1] * SLACK**2
         parts, sizes = [], np.zeros(len(edges) - 1)

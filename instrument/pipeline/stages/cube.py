@@ -22,7 +22,7 @@ from instrument.errors import InputError, InstrumentWarning, unused, warn
 from instrument.foreground.base import ForegroundRemover
 from instrument.image.cube import StokesCube
 from instrument.memory import afford
-from instrument.pipeline.stages.cube_results import CubeResults
+from instrument.pipeline.stages.cube_page import CubeResults
 from instrument.registry import load
 from instrument.units import Count, Finite, Float, NotNegative, Positive, PositiveSeconds, Radians, Real, UvRange
 

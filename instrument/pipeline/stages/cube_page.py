@@ -8,20 +8,26 @@ from instrument.analyze.faraday.cube import FaradayCube
 from instrument.analyze.ixr import removal_table
 from instrument.analyze.power.signal import Signal21cm
 from instrument.pipeline.stage import Draw
-from instrument.pipeline.stages.cube_results import CubeResults
-from instrument.report.cylinders import cylinder, cylinder_ratio, spheres
+from instrument.pipeline.stages.cube_results import CubeProducts
 from instrument.report.page import Block, Figures, Section, Table, Text, number
-from instrument.report.spectra import spectra_2d
 from instrument.units import Float
 
 
-def cube_sections(result: CubeResults, draw: Draw) -> list[Section]:
+class CubeResults(CubeProducts):
+    """What was made of a cube, and its part of the page."""
+
+    def sections(self, draw: Draw) -> list[Section]:
+        """Faraday depth, removal, spectra, window."""
+        return cube_sections(self, draw)
+
+
+def cube_sections(result: CubeProducts, draw: Draw) -> list[Section]:
     """Sections of a page, their figures drawn by `draw`; the window first, for it is what the others are made for."""
     made = (make(result, draw) for make in (_window, _spectra, _faraday, _removal))
     return [*(section for section in made if section is not None), _cube(result)]
 
 
-def _cube(result: CubeResults) -> Section:
+def _cube(result: CubeProducts) -> Section:
     cube = result.cube
     rows = [
         ["channels", f"{len(cube.freq_hz)}, {cube.freq_hz.min() / 1e6:.6g} to {cube.freq_hz.max() / 1e6:.6g} MHz"],
@@ -36,7 +42,7 @@ def _cube(result: CubeResults) -> Section:
     return Section("Cube", [Table(["what", "value"], rows)])
 
 
-def _faraday(result: CubeResults, figure: Draw) -> Section | None:
+def _faraday(result: CubeProducts, figure: Draw) -> Section | None:
     found, peaks = result.faraday, result.peaks
     if found is None or peaks is None:
         return None
@@ -81,11 +87,14 @@ def _brightest(found: FaradayCube) -> Float:
     return np.linspace(max(middle - half, found.depths.min()), min(middle + half, found.depths.max()), 6)
 
 
-def _removal(result: CubeResults, figure: Draw) -> Section | None:
+def _removal(result: CubeProducts, figure: Draw) -> Section | None:
     return None if result.split is None else Section("Foreground removal", [Text(result.said, code=True)])
 
 
-def _spectra(result: CubeResults, figure: Draw) -> Section | None:
+def _spectra(result: CubeProducts, figure: Draw) -> Section | None:
+    from instrument.report.cylinders import cylinder, spheres
+    from instrument.report.spectra import spectra_2d
+
     entries = []
     first = next(iter(result.cylinders.values()), None) or next(iter(result.spheres.values()), None)
     for name, spectrum in result.cylinders.items():
@@ -117,9 +126,11 @@ def _spectra(result: CubeResults, figure: Draw) -> Section | None:
     return Section("Power spectra", [*blocks, Figures(entries)])
 
 
-def _window(result: CubeResults, figure: Draw) -> Section | None:
+def _window(result: CubeProducts, figure: Draw) -> Section | None:
     if not result.windows:
         return None
+    from instrument.report.cylinders import cylinder_ratio
+
     blocks: list[Block] = []
     entries = []
     for name, window in result.windows.items():

@@ -21,12 +21,12 @@ from instrument.analyze.power.window import EoRWindow
 from instrument.errors import InputError, Outcome
 from instrument.foreground.base import Split
 from instrument.image.cube import StokesCube
-from instrument.pipeline.stage import Draw, StageResult
-from instrument.report.page import Card, Section, number
+from instrument.pipeline.stage import StageResult
+from instrument.report.page import Card, number
 
 
 @dataclass
-class CubeResults(StageResult):
+class CubeProducts(StageResult):
     """What was made of a cube: spectra by name, windows, Faraday cube, what was left out and why, seconds."""
 
     settings: Any  # the `CubeAnalysis` that made it
@@ -139,12 +139,6 @@ class CubeResults(StageResult):
             Card(f"EoR window, {name or 'as it is'}", f"{number(100 * window.area()[1])} %", "of the area of the bins")
             for name, window in self.windows.items()
         ]
-
-    def sections(self, draw: Draw) -> list[Section]:
-        """Faraday depth, removal, spectra, window."""
-        from instrument.pipeline.stages.cube_page import cube_sections
-
-        return cube_sections(self, draw)
 
     def figures(self) -> dict[str, Any]:
         """Settings, what was left out, checks, and the numbers of every product."""
