@@ -90,6 +90,7 @@ def test_a_plan_is_saved_block_by_block_and_read_in_parts(plan, tmp_path):
     same(ins.Visibilities.open(tmp_path / "copy.h5"), whole)
 
 
+@pytest.mark.long
 def test_memory_does_not_grow_with_what_is_saved_or_read(tmp_path, monkeypatch):
     import tracemalloc
 

@@ -160,7 +160,8 @@ def test_g10_every_writer_refuses_what_is_there_and_takes_overwrite(tmp_path, wo
 def test_g10_every_public_write_has_the_argument():
     lacking = []
     for path in (Path(ins.__file__).parent).rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
+        text = path.read_text(encoding="utf-8")
+        for node in ast.walk(ast.parse(text)) if "def write" in text or "def save" in text else ():
             if isinstance(node, ast.FunctionDef) and (node.name in ("write", "save") or node.name.startswith("write_")):
                 names = [a.arg for a in node.args.args]
                 fresh = {"folder", "partial", "self"} & set(names[:2]) and "path" not in names
@@ -260,7 +261,9 @@ def test_g12_version(capsys):
     assert said_by(capsys, "--version") == (0, f"instrument {ins.__version__}\n", "")
 
 
-def test_g12_every_file_of_a_run_says_what_made_it(here, capsys):
+def test_g12_every_file_of_a_run_says_what_made_it(here, capsys, monkeypatch):
+    pixel = bytes.fromhex("89504e470d0a1a0a0000000d4948445200000001000000010802000000907753de")
+    monkeypatch.setattr("instrument.report.style.save", lambda drawing, path: path.write_bytes(pixel) and path)  # 5 s
     assert main(["run", "s.toml", "--out", "o"]) in (0, 3)
     record = json.loads((here / "o" / "run.json").read_text())
     assert re.fullmatch(r"[0-9a-f]{16}", record["scene_hash"])
@@ -318,11 +321,10 @@ def test_g12_warnings_point_at_the_line_of_the_caller(world):
 
 def test_g12_there_is_one_helper_for_warnings():
     found = [
-        f"{path.name}:{node.lineno}"
+        path.name
         for top in ("instrument", "instrument_plugins")
         for path in Path(__import__(top).__file__).parent.rglob("*.py")
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.Call) and ast.unparse(node.func) == "warnings.warn" and path.name != "errors.py"
+        if "warnings.warn(" in path.read_text(encoding="utf-8") and path.name != "errors.py"
     ]
     assert found == []
 
