@@ -33,9 +33,7 @@ KINDS = ("I", "Q", "U", "V")
 
 def make_plan(
     name: str,
-    instrument: Instrument,
-    sky: Sky,
-    observation: Observation,
+    given: tuple[Instrument, Sky, Observation],
     tolerance: float = 0.0,
     engine: str | None = None,
     memory: Any = None,
@@ -46,7 +44,7 @@ def make_plan(
     tolerance = TOLERANCE.check(tolerance, "tolerance")
     workers = (os.cpu_count() or 1) if workers is None else COUNT.check(workers, "workers")
     uv_range = None if uv_range is None else UV_RANGE.check(uv_range, "uv_range")
-    full = _as_given(instrument, sky, observation)
+    full = _as_given(*given)
     scale_jy = _scale(full)
     kept: list[Item] = []
     left_out: list[Item] = []

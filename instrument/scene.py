@@ -40,9 +40,7 @@ class Scene(Component):
         """
         return make_plan(
             self.name,
-            self.instrument,
-            self.sky,
-            self.observation,
+            (self.instrument, self.sky, self.observation),
             tolerance=tolerance,
             engine=engine,
             memory=memory,

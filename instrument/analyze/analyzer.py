@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from instrument.analyze.faraday.cube import FaradayCube
-from instrument.analyze.faraday.synthesis import Division, Precision, rm_synthesis
+from instrument.analyze.faraday.synthesis import Division, Precision, Synthesis, rm_synthesis
 from instrument.analyze.power.cells import Cells, cylindrical, spherical
 from instrument.analyze.power.cylinders import Cylindrical, Spherical
 from instrument.analyze.power.fourier import Stokes, Taper
 from instrument.analyze.power.signal import Signal21cm
 from instrument.analyze.power.spectra import Spectrum2D, spectrum_2d
-from instrument.analyze.power.transform import cells_of
+from instrument.analyze.power.transform import Transform, cells_of
 from instrument.analyze.power.window import EoRWindow, eor_window
 from instrument.analyze.sources.leakage import Leakage, leakage_of
 from instrument.analyze.sources.photometry import ForcedPhotometry, SourceFluxes
@@ -115,9 +115,8 @@ class Analyzer:
         """
         if self.cube is None:
             raise InputError("power spectra need a cube: Analyzer(cube)")
-        return cells_of(
-            self.cube, stokes, taper, taper_space, uv_range, cross, psf_corrected, infill, redshift, cosmology
-        )
+        how = Transform(stokes, taper, taper_space, uv_range, psf_corrected, infill, redshift, cosmology)
+        return cells_of(self.cube, how, cross)
 
     def cylindrical(
         self,
@@ -232,8 +231,8 @@ class Analyzer:
         if self.cube is None:
             raise InputError("rm_synthesis needs a cube: Analyzer(cube)")
         say_unequal_beams(self.cube.psf)
-        given = (depths, stokes, weights, lambda2_0, spectral_index, divide_by_i, precision, out, noise, progress)
-        return rm_synthesis(self.cube, *given)
+        how = Synthesis(depths, stokes, weights, lambda2_0, spectral_index, divide_by_i, precision, out, noise)
+        return rm_synthesis(self.cube, how, progress)
 
     def _centre(self) -> Direction:
         found = self.centre or (self.cube.centre if self.cube is not None else None)

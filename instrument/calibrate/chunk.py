@@ -71,20 +71,7 @@ class Job:
             finite = np.isfinite(m).all(axis=(-3, -2, -1)) if m.size else finite
             m = np.where(np.isfinite(m), m, 0.0)
         v, m, level = _scaled(v, m, w, s.pattern == "phase")
-        power = m.real**2 + m.imag**2
-        each = power.reshape(len(cells), -1, len(a1), 2, 2).sum(axis=1)
-        used = counted(each)
-        alive = used[..., 0, 0] | used[..., 0, 1] | used[..., 1, 0] | used[..., 1, 1]
-        active = alive @ _ends(a1, a2, stations) > 0
-        held = tied(used, a1, a2, stations, s.pattern)
-        inside = held[:, a1] & held[:, a2]
-        on, rows = alive & inside, v.shape[1] // len(a1)
-        if not on.all():  # data without a model count as left over; those of other pieces of the graph do not
-            v = np.where(np.tile(inside, rows)[..., None, None], v, 0.0)
-            m, power = (np.where(np.tile(on, rows)[..., None, None], x, 0.0) for x in (m, power))
-        samples = on.astype(int)
-        if rows > 1:
-            samples = (power.sum(axis=(2, 3)).reshape(len(cells), rows, -1) > 0).sum(axis=1)
+        v, m, active, held, samples = self._tied(v, m)
         lanes = Lanes(v, m, a1, a2, held, s)
         jones, step, count, history = lanes.iterate(self._start(cells, held, level))
         left = lanes.left(jones, samples)
@@ -130,6 +117,25 @@ class Job:
             gauges,
             named,
         )
+
+    def _tied(self, v: Complex, m: Complex) -> tuple[Complex, Complex, Bool, Bool, Int]:
+        """Data and model (L, N, 2, 2) where they count; stations (L, A) with a model, those tied; samples (L, B)."""
+        a1, a2, stations = self.visibilities.antenna1, self.visibilities.antenna2, len(self.visibilities.layout)
+        power = m.real**2 + m.imag**2
+        each = power.reshape(len(m), -1, len(a1), 2, 2).sum(axis=1)
+        used = counted(each)
+        alive = used[..., 0, 0] | used[..., 0, 1] | used[..., 1, 0] | used[..., 1, 1]
+        active = alive @ _ends(a1, a2, stations) > 0
+        held = tied(used, a1, a2, stations, self.settings.pattern)
+        inside = held[:, a1] & held[:, a2]
+        on, rows = alive & inside, v.shape[1] // len(a1)
+        if not on.all():  # data without a model count as left over; those of other pieces of the graph do not
+            v = np.where(np.tile(inside, rows)[..., None, None], v, 0.0)
+            m, power = (np.where(np.tile(on, rows)[..., None, None], x, 0.0) for x in (m, power))
+        samples = on.astype(int)
+        if rows > 1:
+            samples = (power.sum(axis=(2, 3)).reshape(len(m), rows, -1) > 0).sum(axis=1)
+        return v, m, active, held, samples
 
     def _gathered(self, cells: list[Cell]) -> tuple[Complex, Complex, Float]:
         """Data, model (L, N, 2, 2) and weights (L, N), N samples of all baselines; short intervals are padded."""

@@ -14,7 +14,7 @@ from instrument.checked import checked
 from instrument.component import Component
 from instrument.errors import InputError, Outcome, PluginError, warn
 from instrument.foreground.maps import Plane, StokesMaps, Usable
-from instrument.foreground.score import Score, estimated_score, true_score
+from instrument.foreground.score import Cut, Score, estimated_score, true_score
 from instrument.foreground.separation import Separation as Separation
 from instrument.image.cube import StokesCube
 from instrument.units import Float, Int, Seed
@@ -97,8 +97,8 @@ class Split:
         from the cube alone (`instrument.foreground.score`); an adapted operator is then run once more on the cube with
         a draw of noise (`seed`) added. Raises `InputError` where the cube has too few channels or pixels for that.
         """
-        options = (k_par, k_perp, taper)
-        used, maps, pixel = self._used, self._used.maps, self.cube.pixel_rad
+        used, maps = self._used, self._used.maps
+        cut = Cut(maps.freq_hz, self.cube.pixel_rad, k_par, k_perp, taper)
         if foreground is not None:
             truth = foreground.data[:, self._stokes] if isinstance(foreground, StokesCube) else np.asarray(foreground)
             if truth.shape != (len(used.empty), *used.good.shape):
@@ -106,13 +106,11 @@ class Split:
             truth = np.where(used.good, truth[used.channels], 0.0)
             if not np.isfinite(truth).all():
                 raise InputError("the true foreground is not finite where the cube has data")
-            return true_score(truth, self._maps, maps.freq_hz, pixel, *options)
-        key = (*options, seed)
+            return true_score(truth, self._maps, cut)
+        key = (k_par, k_perp, taper, seed)
         if key not in self._scores:
             again = self._again if self.separation.adapted else None
-            self._scores[key] = estimated_score(
-                maps.plane, self._maps, self.separation.operator, again, maps.freq_hz, pixel, *options, seed
-            )
+            self._scores[key] = estimated_score(maps.plane, self._maps, self.separation.operator, again, cut, seed)
         return self._scores[key]
 
     def _again(self, maps: Any) -> Any:

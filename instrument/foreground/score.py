@@ -83,9 +83,24 @@ class Score:
         return f"{value}{spread}: {self.verdict} (1 = nothing gained, > 1 = worse than not cleaning; {self.how})"
 
 
-def true_score(truth: Any, found: Any, freq_hz: Float, pixel_rad: float, *options: Any) -> Score:
-    """Score against the true foreground; maps (C, Ny, Nx), options as in `Split.score`."""
-    modes, cells = _modes(freq_hz, options[0], options[2]), _cells(freq_hz, pixel_rad, truth.shape[1:], options[1])
+@dataclass(frozen=True, eq=False)
+class Cut:
+    """Where a score is made: channels (C,), pixels, delays above k_par, baselines within k_perp, and the taper."""
+
+    freq_hz: Float
+    pixel_rad: float
+    k_par: float
+    k_perp: tuple[float, float]
+    taper: str | None
+
+    def cells(self, shape: tuple[int, int]) -> Any:
+        """The cells of an image (Ny, Nx) within k_perp."""
+        return _cells(self.freq_hz, self.pixel_rad, shape, self.k_perp)
+
+
+def true_score(truth: Any, found: Any, cut: Cut) -> Score:
+    """Score against the true foreground; maps (C, Ny, Nx)."""
+    modes, cells = _modes(cut.freq_hz, cut.k_par, cut.taper), cut.cells(truth.shape[1:])
     lost = _powers(modes, truth - found, cells)
     all_of_it = _powers(modes, truth, cells)
     if not all_of_it.sum():
@@ -94,72 +109,75 @@ def true_score(truth: Any, found: Any, freq_hz: Float, pixel_rad: float, *option
 
 
 def estimated_score(
-    maps: Any,
-    found: Any,
-    operator: Float | None,
-    again: Callable[[Any], Any] | None,
-    freq_hz: Float,
-    pixel_rad: float,
-    k_par: float,
-    k_perp: tuple[float, float],
-    taper: str | None,
-    seed: int,
+    maps: Any, found: Any, operator: Float | None, again: Callable[[Any], Any] | None, cut: Cut, seed: int
 ) -> Score:
     """Score from maps (C, Ny, Nx) alone; `again` runs an adapted remover once more, else `operator` (C, C) is it."""
-    modes, cells = _modes(freq_hz, k_par, taper), _cells(freq_hz, pixel_rad, maps.shape[1:], k_perp)
-    noise, scale, probes = measured_noise(maps, freq_hz)
-    noise_here = noise[cells]
-    level = np.trace(modes.T @ (scale[:, None] * modes))
-    seen, left = spectra(modes, maps, cells), spectra(modes, maps - found, cells)
-    errors = _Errors(modes, scale, probes, noise_here, float(maps.any(axis=0).mean()))
-    power = float(_power(seen).sum())
-    before = power - float(noise_here.sum() * level)
-    spread = errors.of_noise(seen, np.zeros((modes.shape[1], len(scale))), 0.0)
-    bound = before < 2 * spread
-    total = max(before, 2 * spread)
-    if not total > 0:
-        raise InputError("the cube has no power at these delays: there is nothing to score")
-
-    def drawn(seed: int) -> tuple[Float, Float]:
-        assert again is not None
-        draw = _draw(noise, scale, maps, seed)
-        moved = again(maps + draw.dtype.type(DRAW) * draw) - found
-        response = modes.T @ operator if operator is not None else _response(modes, draw, moved)
-        one, two = spectra(modes, draw, cells), spectra(modes, moved, cells)
-        fitted = (one.real * two.real + one.imag * two.imag).sum(axis=0) / DRAW
-        more = DRAW**2 * noise_here * np.trace(response @ (scale[:, None] * response.T))
-        moving = _power(left - two) - _power(left) + 2 * fitted - more
-        # a choice that turns a bright foreground: gmca, 1 mK, error of a score 20 times larger with it than without
-        return (2 * fitted if errors.of_draw(moving) > TURNS * errors.of_draw(2 * fitted) else moving), response
-
-    def valued(added: Float, response: Float) -> tuple[float, float, float]:
-        value = float((_power(left) - noise_here * level + added).sum() / total)
-        own = errors.of_draw(added) if again else 0.0
-        sigma = np.hypot(errors.of_noise(left - value * seen, response, value), own)
-        # sigma^2 here is a square in `value`, whose own error adds spread^2 sigma^2 / total^2 to it, and 1 / total^2
-        # is on average too large by 3 spread^2 / total^2: at 4 spreads of foreground sigma were 12 % too large
-        scale = float(np.hypot(total, 2 * spread))
-        return value, float(sigma) / scale, own / scale
-
+    made = _Estimate(maps, found, operator, again, cut)
     if again is None:
         assert operator is not None
-        response = modes.T @ operator
+        response = made.modes.T @ operator
         how = "estimated; noise fitted: trace of the operator"
-        value, sigma, _ = valued(2 * noise_here * np.trace(response @ (scale[:, None] * modes)), response)
+        fitted = 2 * made.noise_here * np.trace(response @ (made.scale[:, None] * made.modes))
+        value, sigma, _ = made.valued(fitted, response)
     else:
         how = f"estimated; noise fitted: from one draw, seed {seed}"
-        added, response = drawn(seed)
-        value, sigma, own = valued(added, response)
+        added, response = made.drawn(seed)
+        value, sigma, own = made.valued(added, response)
         draws = 1
         while (
             draws < MOST_DRAWS
             and own > sigma / 2
             and ((sigma > UNSURE * abs(value) and draws < 2) or abs(value - 1) < sigma)
         ):
-            added, draws = added + drawn(seed + draws)[0], draws + 1
+            added, draws = added + made.drawn(seed + draws)[0], draws + 1
             how = f"estimated; noise fitted: from {draws} draws, seeds {seed} to {seed + draws - 1}"
-            value, sigma, own = valued(added / draws, response)
-    return Score(max(value, 0.0), sigma, how, bound, total / power if power else 0.0)
+            value, sigma, own = made.valued(added / draws, response)
+    return Score(max(value, 0.0), sigma, how, made.bound, made.total / made.power if made.power else 0.0)
+
+
+class _Estimate:
+    """What a score is made of: powers seen in maps (C, Ny, Nx) and left in them, the noise, and its errors."""
+
+    def __init__(self, maps: Any, found: Any, operator: Any, again: Callable[[Any], Any] | None, cut: Cut) -> None:
+        self.maps, self.found, self.operator, self.again = maps, found, operator, again
+        self.modes, self.cells = _modes(cut.freq_hz, cut.k_par, cut.taper), cut.cells(maps.shape[1:])
+        self.noise, self.scale, probes = measured_noise(maps, cut.freq_hz)
+        self.noise_here = self.noise[self.cells]
+        self.level = np.trace(self.modes.T @ (self.scale[:, None] * self.modes))
+        self.seen = spectra(self.modes, maps, self.cells)
+        self.left = spectra(self.modes, maps - found, self.cells)
+        self.errors = _Errors(self.modes, self.scale, probes, self.noise_here, float(maps.any(axis=0).mean()))
+        self.power = float(_power(self.seen).sum())
+        before = self.power - float(self.noise_here.sum() * self.level)
+        self.spread = self.errors.of_noise(self.seen, np.zeros((self.modes.shape[1], len(self.scale))), 0.0)
+        self.bound = before < 2 * self.spread
+        self.total = max(before, 2 * self.spread)
+        if not self.total > 0:
+            raise InputError("the cube has no power at these delays: there is nothing to score")
+
+    def drawn(self, seed: int) -> tuple[Float, Float]:
+        """Noise that the remover fitted (N,), from one draw of more of it, and the response (m, C)."""
+        assert self.again is not None
+        draw = _draw(self.noise, self.scale, self.maps, seed)
+        moved = self.again(self.maps + draw.dtype.type(DRAW) * draw) - self.found
+        response = self.modes.T @ self.operator if self.operator is not None else _response(self.modes, draw, moved)
+        one, two = spectra(self.modes, draw, self.cells), spectra(self.modes, moved, self.cells)
+        fitted = (one.real * two.real + one.imag * two.imag).sum(axis=0) / DRAW
+        more = DRAW**2 * self.noise_here * np.trace(response @ (self.scale[:, None] * response.T))
+        moving = _power(self.left - two) - _power(self.left) + 2 * fitted - more
+        # a choice that turns a bright foreground: gmca, 1 mK, error of a score 20 times larger with it than without
+        turns = self.errors.of_draw(moving) > TURNS * self.errors.of_draw(2 * fitted)
+        return (2 * fitted if turns else moving), response
+
+    def valued(self, added: Float, response: Float) -> tuple[float, float, float]:
+        """The score, its error, and the part of that which is of the draw, of the noise that was fitted (N,)."""
+        value = float((_power(self.left) - self.noise_here * self.level + added).sum() / self.total)
+        own = self.errors.of_draw(added) if self.again else 0.0
+        sigma = np.hypot(self.errors.of_noise(self.left - value * self.seen, response, value), own)
+        # sigma^2 here is a square in `value`, whose own error adds spread^2 sigma^2 / total^2 to it, and 1 / total^2
+        # is on average too large by 3 spread^2 / total^2: at 4 spreads of foreground sigma were 12 % too large
+        scale = float(np.hypot(self.total, 2 * self.spread))
+        return value, float(sigma) / scale, own / scale
 
 
 @dataclass(frozen=True, eq=False)

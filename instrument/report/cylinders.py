@@ -51,7 +51,7 @@ def cylinder(
     top = float(np.nanmax(shown))
     # what is a rounding of the largest value is no structure
     norm = LogNorm(max(float(np.nanmin(shown)), 1e-12 * top), top)
-    return _mesh(spectrum, shown, norm, "viridis", label, title, wedges, axes_of(ax, (6.8, 5.4)))
+    return _mesh(spectrum, shown, (norm, "viridis", "neither"), label, title, wedges, axes_of(ax, (6.8, 5.4)))
 
 
 @styled
@@ -72,7 +72,7 @@ def cylinder_ratio(
     what = f"{removed:.0%} removed" if removed else f"leakage {name}"
     title = f"leakage over signal, {what}"
     label = "log$_{10}$ ratio of power"
-    _mesh(spectrum, power, Normalize(-reach, reach), "RdBu_r", label, title, (), ax, extend="both")
+    _mesh(spectrum, power, (Normalize(-reach, reach), "RdBu_r", "both"), label, title, (), ax)
     for i, j in zip(*np.nonzero(window.wedge), strict=True):
         (left, right), (low, high) = spectrum.perp_edges[i : i + 2], spectrum.par_edges[j : j + 2]
         box: Any = {"fill": False, "ec": INK, "lw": 0, "hatch": "///", "zorder": 2}
@@ -139,14 +139,13 @@ def spheres(curves: dict[str, Spherical], signals: Sequence[Signal21cm] = (), ax
 def _mesh(
     spectrum: Cylindrical,
     values: Float,
-    norm: Any,
-    cmap: str,
+    look: tuple[Any, str, str],  # norm, name of the map, which ends go on
     label: str,
     title: str,
     wedges: Sequence[float],
     ax: Axes,
-    extend: str = "neither",
 ) -> Axes:
+    norm, cmap, extend = look
     perp, par = spectrum.perp_edges.copy(), spectrum.par_edges.copy()
     # linear bins that begin at 0 or below are drawn from half-way to their end
     for edges in (perp, par):

@@ -48,18 +48,7 @@ def bubbles(leakage: Leakage, centre: Direction | None = None, kind: Kind = "lin
     reach = 1.08 * max(float(np.abs([east, north]).max(initial=0)), 1e-3)
     ax.set(xlim=(reach, -reach), ylim=(-reach, reach), aspect="equal")
     ax.set(xlabel="offset east (deg)", ylabel="offset north (deg)", title=f"{kind.capitalize()} leakage")
-    crowd = len(east) > 500
-    above = 3 if crowd else 0  # circles would drown below a crowd of sources
-    for radius in (2, 4):
-        ax.add_patch(
-            Circle((0, 0), radius, fill=False, color=INK if crowd else GREY, lw=1, ls=(0, (4, 3)), zorder=1 + above)
-        )
-        if radius < reach:
-            box = {"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none"}
-            x, y = _clearest(radius, east, north)
-            ax.text(
-                x, y, f"{radius}°", color="#555555", size=11, ha="center", va="center", bbox=box, zorder=1.5 + above
-            )
+    _circles(ax, reach, east, north)
 
     # bubbles of a full grid just touch; a crowd of sources gets small ones
     widest = float(np.clip(300 / np.sqrt(max(len(east), 1)), 6, 24))
@@ -81,35 +70,51 @@ def bubbles(leakage: Leakage, centre: Direction | None = None, kind: Kind = "lin
     )
     drawn.set_label("measured")
     lost = ~shown
-    ax.scatter(
-        east[lost],
-        north[lost],
-        s=min(16, widest**2 / 4),
-        marker="x",
-        color=GREY,
-        lw=0.9,
-        zorder=2,
-        label="not measured",
-    )
-    bar = ax.figure.colorbar(
-        drawn, ax=ax, fraction=0.045, pad=0.02, extend="max" if (values[shown] > top).any() else "neither"
-    )
-    bar.set_label(f"leakage ({unit.removeprefix('× ')} of I)", labelpad=8)
-    bar.locator = MaxNLocator(5)
-    bar.update_ticks()
+    cross: Any = {"marker": "x", "color": GREY, "lw": 0.9, "zorder": 2}
+    ax.scatter(east[lost], north[lost], s=min(16, widest**2 / 4), label="not measured", **cross)
+    _bar(drawn, ax, bool((values[shown] > top).any()), unit)
 
     keys = [
         Line2D([], [], ls="", marker="o", ms=area(v) ** 0.5, mfc=cmap(norm(v)), mec=INK, mew=0.4, label=f"{v:g} {unit}")
         for v in MaxNLocator(4).tick_values(0, top)
         if 0 < v <= top
     ][-3:]
+    _legends(ax, keys, int(lost.sum()))
+    return ax
+
+
+def _circles(ax: Axes, reach: float, east: Float, north: Float) -> None:
+    """Circles of 2 and 4 deg about the centre, their radius written where sources leave room."""
+    crowd = len(east) > 500
+    above = 3 if crowd else 0  # circles would drown below a crowd of sources
+    for radius in (2, 4):
+        ax.add_patch(
+            Circle((0, 0), radius, fill=False, color=INK if crowd else GREY, lw=1, ls=(0, (4, 3)), zorder=1 + above)
+        )
+        if radius < reach:
+            box = {"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none"}
+            x, y = _clearest(radius, east, north)
+            ax.text(
+                x, y, f"{radius}°", color="#555555", size=11, ha="center", va="center", bbox=box, zorder=1.5 + above
+            )
+
+
+def _bar(drawn: Any, ax: Axes, over: bool, unit: str) -> None:
+    """The bar of colours; `over` where some are beyond its end."""
+    bar = ax.figure.colorbar(drawn, ax=ax, fraction=0.045, pad=0.02, extend="max" if over else "neither")
+    bar.set_label(f"leakage ({unit.removeprefix('× ')} of I)", labelpad=8)
+    bar.locator = MaxNLocator(5)
+    bar.update_ticks()
+
+
+def _legends(ax: Axes, keys: list[Line2D], lost: int) -> None:
+    """What sizes mean, and how many sources are not measured."""
     below: Any = {"loc": "upper center", "frameon": False, "borderpad": 0}
     ax.add_artist(ax.legend(handles=keys, bbox_to_anchor=(0.5, -0.15), ncols=3, **below))
-    if lost.any():
-        text = f"not measured: near a null, or too faint ({lost.sum()})"
+    if lost:
+        text = f"not measured: near a null, or too faint ({lost})"
         cross = Line2D([], [], ls="", marker="x", ms=4, color=GREY, label=text)
         ax.legend(handles=[cross], bbox_to_anchor=(0.5, -0.23), **below)
-    return ax
 
 
 @styled

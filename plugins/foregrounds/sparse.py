@@ -31,11 +31,10 @@ class Found(NamedTuple):
 
 
 @compiled(nogil=True, fastmath=True)
-def _step(
-    data: Any, unmix: Any, low: Any, high: Any, soft: bool, first: int, last: int, across: Any, gram: Any
-) -> None:
+def _step(data: Any, unmix: Any, threshold: Any, first: int, last: int, across: Any, gram: Any) -> None:
     """Sums of D S^T (rows, n) and S S^T (n, n) over the coefficients first <= p < last, S = threshold(unmix D)."""
     rows, n = data.shape[0], unmix.shape[0]
+    low, high, soft = threshold
     s = np.empty((n, BLOCK), data.dtype)
     one = np.zeros((rows, n), data.dtype)
     two = np.zeros((n, n), data.dtype)
@@ -81,7 +80,7 @@ def step(data: Any, unmix: Float, limit: Float, soft: bool) -> tuple[Float, Floa
     sums = [(np.zeros((rows, n)), np.zeros((n, n))) for _ in range(PARTS)]
     u, (low, high) = unmix.astype(data.dtype), (x.astype(data.dtype) for x in _edges(limit, soft))
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        list(pool.map(lambda i: _step(data, u, low, high, soft, edges[i], edges[i + 1], *sums[i]), range(PARTS)))
+        list(pool.map(lambda i: _step(data, u, (low, high, soft), edges[i], edges[i + 1], *sums[i]), range(PARTS)))
     return np.sum([x for x, _ in sums], axis=0), np.sum([x for _, x in sums], axis=0)
 
 

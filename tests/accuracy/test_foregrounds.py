@@ -127,15 +127,13 @@ def test_the_estimated_score_agrees_with_the_true_one(name, of):
 
 @pytest.mark.parametrize("name", FIXED)
 def test_the_draw_and_the_trace_agree_for_a_fixed_operator(name):
-    from instrument.foreground.score import estimated_score
+    from instrument.foreground.score import Cut, estimated_score
 
     found = split(name, "psf")
     maps, cube = case("psf")[0].data[:, 0], case("psf")[0]
-    options = (cube.freq_hz, cube.pixel_rad, 0.06, (0.02, 0.5), "blackman-harris", 3)
+    cut = Cut(cube.freq_hz, cube.pixel_rad, 0.06, (0.02, 0.5), "blackman-harris")
     operator = found.separation.operator
-    drawn = estimated_score(
-        maps, found._maps, None, lambda x: np.tensordot(operator.astype(np.float32), x, 1), *options
-    )
+    drawn = estimated_score(maps, found._maps, None, lambda x: np.tensordot(operator.astype(np.float32), x, 1), cut, 3)
     # what a fixed operator makes of the 9 % of more noise that a draw supposes is taken off; the draw scatters itself
     assert drawn.value == pytest.approx(found.score().value, rel=0.15)
     assert "draw" in drawn.how and "trace" in found.score().how

@@ -10,8 +10,8 @@ from astropy.table import QTable
 
 from instrument import InputError, StokesCube
 from instrument.analyze.cube_checks import check_cells, check_faraday
-from instrument.analyze.faraday.synthesis import rm_synthesis
-from instrument.analyze.power.transform import cells_of
+from instrument.analyze.faraday.synthesis import Synthesis, rm_synthesis
+from instrument.analyze.power.transform import Transform, cells_of
 from instrument.cli import main
 from instrument.image.psf import Psf
 from instrument.pipeline.stages.cube import CubeAnalysis
@@ -159,7 +159,7 @@ def test_a_removal_that_makes_it_worse_ends_with_status_3(tmp_path, capsys):
 @pytest.mark.parametrize("stokes", ["I", "P"])
 def test_a_check_of_cells_finds_a_cell_that_is_wrong(stokes, settings):
     cube = screens()
-    cells = cells_of(cube, stokes, **settings)
+    cells = cells_of(cube, Transform(stokes, **settings))
     assert check_cells(cube, cells).passed
     cells.power[...] *= 1 + 1e-8
     assert not check_cells(cube, cells).passed
@@ -172,7 +172,7 @@ def test_a_check_of_cells_takes_holes_and_unsorted_channels():
     turn = np.random.default_rng(0).permutation(24)
     cube = StokesCube(data[turn], FREQ[turn], 3 * u.arcmin, "K")
     with pytest.warns(UserWarning, match="hold NaN"):
-        cells = cells_of(cube, "I")
+        cells = cells_of(cube, Transform())
     assert check_cells(cube, cells).passed
 
 
@@ -181,7 +181,7 @@ def test_a_check_of_faraday_spectra_finds_one_that_is_wrong():
     data = cube.data.copy()
     data[4, 1, :20] = np.nan
     cube = StokesCube(data, FREQ, 3 * u.arcmin, "K")
-    found = rm_synthesis(cube, np.linspace(-20, 20, 41))
+    found = rm_synthesis(cube, Synthesis(np.linspace(-20, 20, 41)))
     assert check_faraday(cube, found).passed
     found.data[7] += 1e-4 * np.abs(found.data).max()
     assert not check_faraday(cube, found).passed

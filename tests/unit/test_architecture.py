@@ -344,6 +344,44 @@ def test_no_file_is_longer_than_350_lines():
     assert long == {}
 
 
+LINES, ARGUMENTS = 60, 8
+# Public spellings, whose keywords are what a user may say of one thing, and why each is not cut
+MANY_ARGUMENTS = {
+    "instrument/analyze/analyzer.py: spectrum_2d": "a public spelling: what may be said of one spectrum",
+    "instrument/analyze/analyzer.py: cells": "a public spelling: what may be said of the transform",
+    "instrument/analyze/analyzer.py: cylindrical": "a public spelling: those of `cells`, and the bins",
+    "instrument/analyze/analyzer.py: spherical": "a public spelling: those of `cells`, the bins and the wedge",
+    "instrument/analyze/analyzer.py: eor_window": "a public spelling: those of `cells`, signal, noise and wedge",
+    "instrument/analyze/analyzer.py: rm_synthesis": "a public spelling: what may be said of the synthesis",
+    "instrument/analyze/power/spectra.py: spectrum_2d": "takes the keywords of `Analyzer.spectrum_2d` from sweeps too",
+}
+
+
+def functions(parsed):
+    """Functions of a file, nested ones and methods too: name, lines, arguments."""
+    for node in ast.walk(parsed):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            given = node.args
+            count = len(given.posonlyargs) + len(given.args) + len(given.kwonlyargs)
+            yield node.name, node.end_lineno - node.lineno + 1, count
+
+
+def test_no_function_is_longer_than_60_lines():
+    long = {f"{where(path)}: {name}": n for path in SOURCES for name, n, _ in functions(tree(path)) if n > LINES}
+    assert long == {}
+
+
+def test_no_function_takes_more_than_8_arguments():
+    many = {f"{where(path)}: {name}" for path in SOURCES for name, _, n in functions(tree(path)) if n > ARGUMENTS}
+    assert many == set(MANY_ARGUMENTS)
+
+
+def test_the_checks_of_functions_can_fail():
+    body = "    pass\n" * LINES
+    parsed = ast.parse(f"class A:\n  def f(self, a, b, c, d, e, /, f, g, *, h):\n{body}")
+    assert list(functions(parsed)) == [("f", LINES + 1, ARGUMENTS + 1)]
+
+
 def test_every_module_says_what_it_is_in_one_sentence():
     missing = [where(path) for path in SOURCES if not (ast.get_docstring(tree(path)) or "").strip()]
     assert missing == []

@@ -105,16 +105,17 @@ def power_law(values: Any, weights: Any, offset: Any, sigma: float) -> Any:
 
 
 @compiled(nogil=True, error_model="numpy")
-def divide(
-    cube: Any, channels: Any, first: int, weights: Any, offset: Any, order: Any, fit: int, good: Any, x: Any, level: Any
-) -> None:
-    """Divide x (N, 2, n) by Stokes I of the cube, as level (n,) at offset 0; `offset` (N,) is ln(nu/nu0).
+def divide(cube: Any, channels: Any, first: int, axis: Any, fit: int, good: Any, x: Any, level: Any) -> None:
+    """Divide x (N, 2, n) by Stokes I of the cube, as level (n,) at offset 0.
+
+    `axis` are of the channels (N,) the weights, the offset ln(nu/nu0), and their order by frequency.
 
     `fit` 0 divides each voxel by its own I and takes voxels without I > 0 out of `good`; 1 divides by the power law
     fitted to I of the pixel, and takes pixels without a positive one out; 2 fits where I is below CLEAR times its
     noise, the median of differences of neighbours in `order`. The level is that of the power law, of one channel I.
     """
     nx = cube.shape[3]
+    weights, offset, order = axis
     values = np.empty(len(channels))
     for i in range(x.shape[2]):
         row, column = (first + i) // nx, (first + i) % nx
@@ -199,14 +200,13 @@ def brightest(data: Any, order: Any, first: int, power: Any, place: Any) -> None
 
 
 @compiled(nogil=True, error_model="numpy")
-def summit(
-    data: Any, order: Any, phi: Any, ends: Any, turn: float, pixels: Any, place: Any, depth: Any, value: Any
-) -> None:
+def summit(data: Any, axis: Any, turn: float, pixels: Any, place: Any, depth: Any, value: Any) -> None:
     """Depth (n,) and F (n,) of the largest |F| about `place` (n,) of some pixels, of F in order of growing phi (P,).
 
     F turned by exp(i turn phi), so that it hardly rotates, goes through a polynomial of the POINTS nearest depths in
-    the same piece of the axis: `ends` (2, P) are where the piece of each depth begins and ends.
+    the same piece of the axis. `axis` are the order, phi, and (2, P) where the piece of each depth begins and ends.
     """
+    order, phi, ends = axis
     z, x, share = np.empty(POINTS, np.complex128), np.empty(POINTS), np.empty(3, np.complex128)
     for i in range(len(pixels)):
         p, k = pixels[i], place[i]

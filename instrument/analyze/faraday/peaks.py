@@ -17,7 +17,7 @@ from instrument.analyze.faraday.spectra import FaradaySpectra
 from instrument.errors import InputError
 from instrument.provenance import fits_cards
 from instrument.shown import short_repr
-from instrument.units import Bool, Float, Int
+from instrument.units import Bool, Complex, Float, Int
 from instrument.whole_file import whole_file
 
 RICEAN = 2.3  # George, Stil & Keller 2012
@@ -89,27 +89,14 @@ def find_peaks(cube: FaradaySpectra, snr: float, noise: Any) -> FaradayPeaks:
     threshold = one(snr, "", "snr")
     data = cube.data.reshape(len(order), -1)
     pixels, level = data.shape[1], sigma.ravel()
-    power, place = np.empty(pixels), np.empty(pixels, np.int64)
-
-    def search(first: int) -> None:
-        here = slice(first, first + CHUNK)
-        brightest(data, order, first, power[here], place[here])
-
-    in_threads(search, range(0, pixels, CHUNK))
+    power, place = _largest(data, order)
     height = np.sqrt(np.where(place >= 0, power, np.nan))
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = height / level
     edge = (place == ends[0, place]) | (place == ends[1, place] - 1)
     use = np.flatnonzero((place >= 0) & ~edge & (ratio >= threshold) & (height > 0))
     band = _Channels(cube)
-    depth, value = np.empty(len(use)), np.empty(len(use), complex)
-
-    def climb(first: int) -> None:
-        here = slice(first, first + CHUNK)
-        turn = 2 * (band.mean - cube.lambda2_0)
-        summit(data, order, phi, ends, turn, use[here], place[use[here]], depth[here], value[here])
-
-    in_threads(climb, range(0, len(use), CHUNK))
+    depth, value = _climbed(data, (order, phi, ends), 2 * (band.mean - cube.lambda2_0), use, place[use])
     top = np.abs(value)
     found = band.errors(use, top, level[use])
     span = float(phi[-1] - phi[0])
@@ -148,6 +135,31 @@ def find_peaks(cube: FaradaySpectra, snr: float, noise: Any) -> FaradayPeaks:
         lambda2_0=cube.lambda2_0,
         snr_min=threshold,
     )
+
+
+def _largest(data: Complex, order: Int) -> tuple[Float, Int]:
+    """Largest |F|² over depths (P, n), and its place in their order, -1 where there is none."""
+    pixels = data.shape[1]
+    power, place = np.empty(pixels), np.empty(pixels, np.int64)
+
+    def search(first: int) -> None:
+        here = slice(first, first + CHUNK)
+        brightest(data, order, first, power[here], place[here])
+
+    in_threads(search, range(0, pixels, CHUNK))
+    return power, place
+
+
+def _climbed(data: Complex, axis: tuple[Int, Float, Int], turn: float, use: Int, place: Int) -> tuple[Float, Complex]:
+    """Depth and F (n,) of the peaks near places (n,) of some pixels (n,); the rest as of `summit`."""
+    depth, value = np.empty(len(use)), np.empty(len(use), complex)
+
+    def climb(first: int) -> None:
+        here = slice(first, first + CHUNK)
+        summit(data, axis, turn, use[here], place[here], depth[here], value[here])
+
+    in_threads(climb, range(0, len(use), CHUNK))
+    return depth, value
 
 
 def _noise(cube: FaradaySpectra, noise: Any) -> Float:

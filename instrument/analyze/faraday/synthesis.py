@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -28,67 +29,51 @@ CHUNK_BYTES = 8 << 20  # of one product: 4 to 16 MB cost the same within 5 %
 RELEASE_BYTES = 256 << 20  # written to a file between two releases of its pages
 
 
-def rm_synthesis(
-    cube: StokesCube,
-    depths: Any = None,
-    stokes: Stokes = "P",
-    weights: Any = None,
-    lambda2_0: Any = None,
-    spectral_index: float | None = None,
-    divide_by_i: Division = False,
-    precision: Precision | None = None,
-    out: str | os.PathLike[str] | None = None,
-    noise: Any = None,
-    progress: Callable[[float], None] | None = None,
-) -> FaradayCube:
+@dataclass(frozen=True)
+class Synthesis:
+    """How a cube is brought to Faraday depth; see `Analyzer.rm_synthesis`."""
+
+    depths: Any = None
+    stokes: Stokes = "P"
+    weights: Any = None
+    lambda2_0: Any = None
+    spectral_index: float | None = None
+    divide_by_i: Division = False
+    precision: Precision | None = None
+    out: str | os.PathLike[str] | None = None
+    noise: Any = None
+
+    def check(self) -> None:
+        """Raises `InputError` for words that are not known, and for two ways to take the spectrum out."""
+        stokes, precision = self.stokes, self.precision
+        if stokes not in get_args(Stokes):
+            raise InputError(f"stokes = '{stokes}' is not known; {did_you_mean(str(stokes), get_args(Stokes))}")
+        if precision not in (None, *get_args(Precision)):
+            raise InputError(f"precision = {precision!r} is not one of 'single', 'double' or None (that of the cube)")
+        if self.divide_by_i and (stokes == "I" or self.spectral_index is not None):
+            raise InputError(
+                "divide_by_i takes the spectrum out of Q, U or V: leave out spectral_index, and stokes = 'I'"
+            )
+
+
+def rm_synthesis(cube: StokesCube, how: Synthesis, progress: Callable[[float], None] | None = None) -> FaradayCube:
     """Faraday dispersion function of a cube; see `Analyzer.rm_synthesis`.
 
     A chunk of pixels costs one real product with cos and sin of the distinct |phi|: half, where depths come in pairs.
     """
-    if stokes not in get_args(Stokes):
-        raise InputError(f"stokes = '{stokes}' is not known; {did_you_mean(str(stokes), get_args(Stokes))}")
-    if precision not in (None, *get_args(Precision)):
-        raise InputError(f"precision = {precision!r} is not one of 'single', 'double' or None (that of the cube)")
-    if divide_by_i and (stokes == "I" or spectral_index is not None):
-        raise InputError("divide_by_i takes the spectrum out of Q, U or V: leave out spectral_index, and stokes = 'I'")
-    voxels = _Voxels(cube, stokes, weights, precision, one(spectral_index or 0.0, "", "spectral_index"), divide_by_i)
-    phi, band = _depths(depths, voxels)
+    how.check()
+    stokes = how.stokes
+    index = one(how.spectral_index or 0.0, "", "spectral_index")
+    voxels = _Voxels(cube, stokes, how.weights, how.precision, index, how.divide_by_i)
+    phi, band = _depths(how.depths, voxels)
     w, lambda2, real = voxels.w, voxels.lambda2, voxels.real
     mean = float(w @ lambda2 / w.sum())
-    centre = mean if lambda2_0 is None else NOT_NEGATIVE.check(one(lambda2_0, "m2", "lambda2_0"), "lambda2_0")
-    given = _noise(noise, cube.unit, len(voxels.freq), bool(divide_by_i))
+    centre = mean if how.lambda2_0 is None else NOT_NEGATIVE.check(one(how.lambda2_0, "m2", "lambda2_0"), "lambda2_0")
+    given = _noise(how.noise, cube.unit, len(voxels.freq), bool(how.divide_by_i))
     product = Product(phi, lambda2 - centre, voxels.scaled / w.sum(), real)
-    planes, pixels = (2 if stokes == "P" else 1), voxels.values[0, 0].size
-    size = int(np.clip(CHUNK_BYTES // (2 * len(product.rows) * planes * real().itemsize), 64, 8192))
-    merge = combine if stokes == "P" else combine_real
-
-    def transform(first: int, data: Complex) -> Any:
-        n = min(size, pixels - first)
-        x, good, level = voxels.of(first, n)
-        factor, missing = np.ones(n, real), None
-        if good is not None:
-            if not good.all():
-                missing = np.zeros((len(voxels.freq), n), bool)
-                missing[voxels.channels] = ~good
-                missing = np.packbits(missing, axis=0)
-            left = w @ good
-            factor[:] = np.divide(level * w.sum(), left, out=np.full(n, np.nan), where=left > 0)
-        sums = product(x[:, :planes].reshape(len(w), -1)).reshape(2, -1, planes, n)
-        merge(sums, product.place, product.sign, factor, first, data)
-        some = slice((n - min(n, each)) // 2, (n + min(n, each)) // 2)
-        f = np.abs(data[:, first + some.start : first + some.stop])
-        return missing, voxels.sample(x[:, :, some], good if good is None else good[:, some], level[some], phi, f)
-
-    each = -(-SAMPLE * size // pixels)
-    kind = np.dtype(np.complex128 if real is np.float64 else np.complex64)
-    if out is None:
-        what = f"a Faraday cube of {len(phi)} depths and {pixels} pixels"
-        afford(len(phi) * pixels * kind.itemsize, what, "give fewer depths, a part of the image, or out='f.npy'")
-    every = max(1, RELEASE_BYTES // (len(phi) * size * kind.itemsize))
-    with allocated((len(phi), pixels), kind, out) as (data, release):
-        found = in_threads(lambda first: transform(first, data), range(0, pixels, size), progress, release, every)
-    if out is not None:
-        data = np.load(out, mmap_mode="c")  # what is written to the array does not go to the file
+    pixels = voxels.values[0, 0].size
+    chunks = _Chunks(voxels, product, phi)
+    data, found = _transformed(chunks, pixels, how.out, progress)
     measured = voxels.measured([part for _, part in found])
     span = np.ptp(phi)
     steps = np.arange(1 - len(phi), len(phi)) if span else np.zeros(1)
@@ -105,12 +90,12 @@ def rm_synthesis(
         noise=None if given is None else voxels.of_sum(given[voxels.channels] * voxels.scaled / w),
         measured_noise=voxels.of_sum(measured),
         channel_noise=voxels.all_channels(measured if given is None else given[voxels.channels] * voxels.scaled / w),
-        flags=_flags([part for part, _ in found], len(voxels.freq), pixels, size),
+        flags=_flags([part for part, _ in found], len(voxels.freq), pixels, chunks.size),
         pixel_rad=cube.pixel_rad,
         centre=cube.centre,
         reference_hz=voxels.reference,
-        spectral_index=spectral_index,
-        divided=bool(divide_by_i),
+        spectral_index=how.spectral_index,
+        divided=bool(how.divide_by_i),
     )
     object.__setattr__(result, "rmsf", result.rmsf_at(result.rmsf_depths))
     for text in band.complaints(phi) if stokes == "P" and band is not None else ():
@@ -164,7 +149,8 @@ class _Voxels:
                 f"Stokes {self.stokes} has values beyond {self.limit:.2g} in channel {wrong}: make infinite pixels NaN"
             )
         if self.division >= 0:
-            divide(self.values, self.channels, first, self.w, self.offset, self.order, self.division, good, x, level)
+            axis = self.w, self.offset, self.order
+            divide(self.values, self.channels, first, axis, self.division, good, x, level)
         return x, good, level
 
     def sample(self, x: Any, good: Any, level: Float, phi: Float, size: Float) -> tuple[Any, ...]:
@@ -191,6 +177,55 @@ class _Voxels:
         out = np.full(len(self.freq), np.nan)
         out[self.channels] = values
         return out
+
+
+class _Chunks:
+    """Chunks of pixels of one synthesis, brought to the depths phi (D,)."""
+
+    def __init__(self, voxels: _Voxels, product: Product, phi: Float) -> None:
+        self.voxels, self.product, self.phi = voxels, product, phi
+        self.planes, pixels = (2 if voxels.stokes == "P" else 1), voxels.values[0, 0].size
+        each = 2 * len(product.rows) * self.planes * voxels.real().itemsize
+        self.size = int(np.clip(CHUNK_BYTES // each, 64, 8192))
+        self.sample = -(-SAMPLE * self.size // pixels)
+
+    def transform(self, first: int, data: Complex) -> Any:
+        """F of the pixels from `first` on into data (D, pixels); bits of what is missing, a sample for the noise."""
+        voxels, w = self.voxels, self.voxels.w
+        n = min(self.size, data.shape[1] - first)
+        x, good, level = voxels.of(first, n)
+        factor, missing = np.ones(n, voxels.real), None
+        if good is not None:
+            if not good.all():
+                missing = np.zeros((len(voxels.freq), n), bool)
+                missing[voxels.channels] = ~good
+                missing = np.packbits(missing, axis=0)
+            left = w @ good
+            factor[:] = np.divide(level * w.sum(), left, out=np.full(n, np.nan), where=left > 0)
+        sums = self.product(x[:, : self.planes].reshape(len(w), -1)).reshape(2, -1, self.planes, n)
+        merge = combine if voxels.stokes == "P" else combine_real
+        merge(sums, self.product.place, self.product.sign, factor, first, data)
+        some = slice((n - min(n, self.sample)) // 2, (n + min(n, self.sample)) // 2)
+        f = np.abs(data[:, first + some.start : first + some.stop])
+        part = good if good is None else good[:, some]
+        return missing, voxels.sample(x[:, :, some], part, level[some], self.phi, f)
+
+
+def _transformed(chunks: _Chunks, pixels: int, out: Any, progress: Any) -> tuple[Complex, list[Any]]:
+    """F (D, pixels), in memory or mapped from a file, and what every chunk found."""
+    depths, size = len(chunks.phi), chunks.size
+    kind = np.dtype(np.complex128 if chunks.voxels.real is np.float64 else np.complex64)
+    if out is None:
+        what = f"a Faraday cube of {depths} depths and {pixels} pixels"
+        afford(depths * pixels * kind.itemsize, what, "give fewer depths, a part of the image, or out='f.npy'")
+    every = max(1, RELEASE_BYTES // (depths * size * kind.itemsize))
+    with allocated((depths, pixels), kind, out) as (data, release):
+        found = in_threads(
+            lambda first: chunks.transform(first, data), range(0, pixels, size), progress, release, every
+        )
+    if out is not None:
+        data = np.load(out, mmap_mode="c")  # what is written to the array does not go to the file
+    return data, found
 
 
 def _depths(depths: Any, voxels: _Voxels) -> tuple[Float, FaradayBand | None]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -30,68 +31,56 @@ COLUMNS = 512  # cells transformed along frequency at once: 1.3 MB of 161 channe
 WEAK = 0.05  # of the largest response of a PSF: cells below it are not divided by it, but left out
 
 
-def cells_of(
-    cube: StokesCube,
-    stokes: Stokes = "I",
-    taper: Taper | None = "blackman-harris",
-    taper_space: Taper | None = None,
-    uv_range: tuple[float, float] | None = None,
-    cross: StokesCube | None = None,
-    psf_corrected: bool = False,
-    infill: Any = None,
-    redshift: float | None = None,
-    cosmology: Any = None,
-) -> Cells:
-    """Cells of a cube, or of one cube across another (the real part); see `Analyzer.cylindrical`.
+@dataclass(frozen=True)
+class Transform:
+    """How a cube is brought to its Fourier cells; see `Analyzer.cells`."""
+
+    stokes: Stokes = "I"
+    taper: Taper | None = "blackman-harris"
+    taper_space: Taper | None = None
+    uv_range: tuple[float, float] | None = None
+    psf_corrected: bool = False
+    infill: Any = None
+    redshift: float | None = None
+    cosmology: Any = None
+
+
+def cells_of(cube: StokesCube, settings: Transform, cross: StokesCube | None = None) -> Cells:
+    """Cells of a cube, or of one cube across another (the real part); see `Analyzer.cells`.
 
     P = V / N² |DFT(w x)|² / mean w² (V the comoving volume, N the voxels): its sum over all cells over V is the
     variance (Parseval). Raises `InputError` for cubes that have no such spectrum.
     """
+    stokes, cosmology = settings.stokes, settings.cosmology
     check_stokes(stokes)
-    infill = None if infill is None else one_si(infill, "s", "infill", above=0)
+    infill = None if settings.infill is None else one_si(settings.infill, "s", "infill", above=0)
     order, grid_hz, here = even_channels(cube, infill is not None)
     freq = float((grid_hz[0] + grid_hz[-1]) / 2)
-    redshift = check_redshift(redshift, float(grid_hz[0]), float(grid_hz[-1]))
+    redshift = check_redshift(settings.redshift, float(grid_hz[0]), float(grid_hz[-1]))
     z, distance = comoving(freq, redshift, cosmology)
     depth = line_of_sight(z, cosmology)
     ny, nx = cube.data.shape[2:]
     cubes = [cube] if cross is None else [cube, same_grid(cube, cross)]
     masks = [_mask(c, stokes, order, infill is not None) for c in cubes]
     has, seen = (np.logical_and.reduce([m[k] for m in masks]) for k in (0, 1))
-    sums = [m[2] for m in masks]
     here = here.copy()
     here[here] = seen
-    window = has * np.multiply.outer(taper_of(ny, taper_space), taper_of(nx, taper_space))
-    if not window.any():
-        raise InputError(f"{stokes} has no data: every pixel is NaN in some channel, or where the taper is not 0")
-    if not has.all():
-        text = f"{1 - has.mean():.2g} of the lines of sight hold NaN and count as zero: rims of holes scatter power"
-        warn(text)
-    v, u = np.fft.fftfreq(ny, cube.pixel_rad), np.fft.fftfreq(nx, cube.pixel_rad)
+    window = _window(has, settings)
     half = stokes != "P"  # of a real image half the plane is made
-    low, high = uv_limits(uv_range)
-    columns = np.flatnonzero(np.abs(u[: nx // 2 + 1] if half else u) <= high)
-    uv = np.hypot(v[:, None], u[columns])
-    times = np.broadcast_to((_both_signs(nx) if half else np.ones(nx))[columns], uv.shape)
-    (use,) = np.nonzero(((uv >= low) & (uv <= high)).ravel())
-    if not use.size:
-        raise InputError(f"uv_range = {uv_range} holds no cell of an image of {nx} x {ny}")
+    columns, uv, times, use = _within(cube, half, settings.uv_range)
     left_out: dict[str, int] = {}
-    along = taper_of(len(grid_hz), taper)
+    along = taper_of(len(grid_hz), settings.taper)
     spectra, response = [], None
-    if psf_corrected:
+    if settings.psf_corrected:
         response = _response(cube, order[seen], columns, use)
         strong = response.min(axis=0) >= WEAK * response.max()
         left_out["cells where the PSF is weak"] = int((~strong).sum())
         use, response = use[strong], response[:, strong]
-    for c, total in zip(cubes, sums, strict=True):
-        found = _transform(c, stokes, order[seen], window, has, total[seen], columns, use)
+    for c, mask in zip(cubes, masks, strict=True):
+        found = _transform(c, stokes, order[seen], window, has, mask[2][seen], columns, use)
         if response is not None:
             found /= response
-        if not here.all():
-            some, found = found, np.empty((len(grid_hz), use.size), complex)
-            found[here], found[~here] = some, infill_operator(grid_hz, here, infill) @ some
-        spectra.append(found)
+        spectra.append(found if here.all() else _filled(found, grid_hz, here, infill))
     n = len(grid_hz)
     square = float((window**2).mean() * (along**2).mean())
     # V / N^2 = cell / N: the volume of a voxel over their number
@@ -101,8 +90,9 @@ def cells_of(
     if not 1 / LARGEST**2 < float(auto.max()) < LARGEST**2:  # only then is it worth to look at all voxels
         squarable(max(_size(c, stokes) for c in cubes), stokes)
     frame = Frame(
-        cube.unit, stokes, freq, z, distance, depth, taper, taper_space, uv_range and (low, high),
-        1 - float(has.mean()), int((~here).sum()), psf_corrected,
+        cube.unit, stokes, freq, z, distance, depth, settings.taper, settings.taper_space,
+        settings.uv_range and uv_limits(settings.uv_range), 1 - float(has.mean()), int((~here).sum()),
+        settings.psf_corrected,
     )  # fmt: skip
     k_par = 2 * np.pi * np.arange(len(folds)) / (n * (grid_hz[1] - grid_hz[0]) * depth)
     rising = np.argsort(uv.ravel()[use], kind="stable")
@@ -115,6 +105,39 @@ def cells_of(
     step = *(2 * np.pi / (distance * n * cube.pixel_rad) for n in (ny, nx)), float(k_par[1])
     places = times.ravel()[use], folds, row, columns[column]
     return Cells(frame, k_perp, k_par, power, auto, *places, Modes(window, along, step, half), left_out)
+
+
+def _window(has: Bool, settings: Transform) -> Float:
+    """What an image is multiplied with (Ny, Nx): the taper where there are data."""
+    window = has * np.multiply.outer(*(taper_of(n, settings.taper_space) for n in has.shape))
+    if not window.any():
+        text = "every pixel is NaN in some channel, or where the taper is not 0"
+        raise InputError(f"{settings.stokes} has no data: {text}")
+    if not has.all():
+        text = f"{1 - has.mean():.2g} of the lines of sight hold NaN and count as zero: rims of holes scatter power"
+        warn(text)
+    return np.asarray(window)
+
+
+def _within(cube: StokesCube, half: bool, uv_range: tuple[float, float] | None) -> tuple[Int, Float, Float, Int]:
+    """Columns (C,) of the plane, |u| and how many cells each stands for (Ny, C), and which (N,) of these are wanted."""
+    ny, nx = cube.data.shape[2:]
+    v, u = np.fft.fftfreq(ny, cube.pixel_rad), np.fft.fftfreq(nx, cube.pixel_rad)
+    low, high = uv_limits(uv_range)
+    columns = np.flatnonzero(np.abs(u[: nx // 2 + 1] if half else u) <= high)
+    uv = np.hypot(v[:, None], u[columns])
+    times = np.broadcast_to((_both_signs(nx) if half else np.ones(nx))[columns], uv.shape)
+    (use,) = np.nonzero(((uv >= low) & (uv <= high)).ravel())
+    if not use.size:
+        raise InputError(f"uv_range = {uv_range} holds no cell of an image of {nx} x {ny}")
+    return columns, uv, times, use
+
+
+def _filled(some: Complex, grid_hz: Float, here: Bool, infill: Any) -> Complex:
+    """All channels (F, N) from those that are here."""
+    out = np.empty((len(grid_hz), some.shape[1]), complex)
+    out[here], out[~here] = some, infill_operator(grid_hz, here, infill) @ some
+    return out
 
 
 def _both_signs(n: int) -> Float:
