@@ -285,6 +285,11 @@ def one_line(cls: type[BaseModel], error: ValidationError) -> str:
             parts.append(
                 f"{where or cls.__name__} = {brief(item['input'])} must be a table{keys and f': {{ {keys} = ... }}'}"
             )
+        elif kind == "literal_error":
+            known = re.findall(r"'([^']+)'", item["ctx"]["expected"])
+            near = get_close_matches(str(item["input"]), known, 1)
+            hint = f": did you mean '{near[0]}'?" if near else ""
+            parts.append(f"{where} = {brief(item['input'])} is not one of {', '.join(map(repr, known))}{hint}")
         elif kind in ("tuple_type", "list_type"):
             parts.append(f"{where} = {brief(item['input'])} must be a list, in brackets")
         else:

@@ -120,6 +120,7 @@ class _Job:
         self.unknowns = 0
         # of each cluster, and of one direction for all: intervals and those that failed; |error|^2 and elements
         self.solved, self.errors = np.zeros((len(names) + 1, 2)), np.zeros((len(names), 2))
+        self.apart = np.zeros((2, 2, len(names)))  # with many directions and with one: sums of |x|^2, and how many
 
     @property
     def slots(self) -> int:
@@ -197,6 +198,14 @@ class _Job:
         use = np.asarray(np.isfinite(single).all(axis=(-2, -1)))
         self._sum("one", use, {"one_left": data.data - single, "one_wrong": clean.data - single})
         self.solved[-1] += one.outcome.size, (one.outcome != Outcome.CONVERGED).sum()
+        for k, (name, whole) in enumerate(models.items()):
+            some = whole.block(slice(self.steps[k] // 2, None, self.steps[k]), slice(None))  # one of each interval
+            seen = some.corrupted(terms[name])
+            seen = seen.corrupted(self.gains) if self.gains.terms else seen
+            for j, term in enumerate((solution[name].term, one.term)):
+                gap = np.abs(seen.data - some.corrupted(term).data) ** 2
+                good = np.isfinite(gap)
+                self.apart[j, :, k] += gap[good].sum(), good.sum()
 
     def _sum(self, kind: str, use: Bool, parts: dict[str, Complex]) -> None:
         self.samples[kind] += 4 * int(use.sum())
@@ -211,11 +220,12 @@ class _Job:
         power["due"] = power["noise"] * (1 - taken) + power.pop("turning")
         with np.errstate(divide="ignore", invalid="ignore"):
             error = np.sqrt(self.errors[:, 0] / self.errors[:, 1])
+            apart = np.sqrt(self.apart[:, 0] / self.apart[:, 1])
         failed = self.solved[:, 1] / self.solved[:, 0]
         return ManyDirectionsResult(
             names=tuple(self.names), sources=self.sources, flux_jy=self.flux_jy, error=error, failed=failed[:-1],
             one_failed=float(failed[-1]), failures=tuple(f"{n} {o.value}" for o, n in self.outcomes.most_common()),
-            **{f"{name}_jy": float(np.sqrt(value)) for name, value in power.items()},
+            apart_jy=apart, **{f"{name}_jy": float(np.sqrt(value)) for name, value in power.items()},
         )  # fmt: skip
 
 

@@ -23,7 +23,9 @@ class ManyDirectionsResult:
     removed (what a model hardly sees is no gauge: noise fills it); `failed` (C,) is the share of intervals without a
     solution. `left_jy` remains of the data after subtraction, `due_jy` is what the noise, less the degrees of freedom
     of the solution, and the turning within intervals leave; `wrong_jy` is what was subtracted less the noiseless data.
-    `one_*` are those of one direction for all. `failures` says how intervals failed.
+    `one_*` are those of one direction for all. `failures` says how intervals failed. `apart_jy` (2, C) is the rms of
+    what each cluster adds to noiseless data less what is subtracted of it, with many directions and with one, from an
+    integration of each interval.
     """
 
     __repr__ = short_repr
@@ -41,6 +43,7 @@ class ManyDirectionsResult:
     one_wrong_jy: float
     one_failed: float
     failures: tuple[str, ...] = ()
+    apart_jy: Float | None = None
 
     @property
     def passed(self) -> bool:

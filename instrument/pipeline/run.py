@@ -154,13 +154,15 @@ def _write(result: Result, tables: dict[str, Any], folder: Path) -> None:
         stage.write(folder)
     what = record(result, tables)
     draw = drawer(folder)
-    made = list(result.stages.values())
-    page = page_of_run(
-        what,
-        cards=[card for stage in made for card in stage.cards()],
-        sections=[section for stage in reversed(made) for section in stage.sections(draw)],
-        tables=[section for stage in made for section in stage.tables()],
-    )
+    # what the scene is about comes first, then the last that was made of it
+    made = [*reversed(result.stages.values())]
+    made.sort(key=lambda stage: not stage.leading)
+    sections = [section for stage in made for section in stage.sections(draw)]
+    long = [section for stage in made for section in stage.tables()]
+    cards = [card for stage in made for card in stage.cards()]
+    # all but the page itself is written by now
+    what |= costs(result.seconds | {WRITE: time.perf_counter() - begin}, result.grown, result.whole)
+    page = page_of_run(what, cards, sections, long)
     write_page(page, folder / "report.html")
     what |= costs(result.seconds | {WRITE: time.perf_counter() - begin}, result.grown, result.whole)
     (folder / "run.json").write_text(json_text(what), encoding="utf-8")

@@ -166,7 +166,13 @@ class EachBlock(StageRun):
 
 
 class StageResult:
-    """What a stage has made, and how it is told: in run.json, on the terminal, in files, on the page."""
+    """What a stage has made, and how it is told: in run.json, on the terminal, in files, on the page.
+
+    A scene that has a `leading` one is about it: its part of the page comes first. Others follow from the last that
+    was made to the first.
+    """
+
+    leading: ClassVar[bool] = False
 
     @property
     def passed(self) -> bool:

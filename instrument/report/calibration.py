@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from instrument.report.style import BLUE, GREY, ORANGE, axes_of, styled
 
@@ -18,13 +19,16 @@ if TYPE_CHECKING:
 def gains(solution: Solution, channel: int = 0) -> Figure:
     """Amplitude and phase of both receptors of every station (A rows) against time, as images in one figure.
 
-    Departures from the median of each station; phases relative to the first station. White is no solution.
+    Departures from the median of each station; phases relative to the first station. Grey is no solution. Names of
+    stations are every so many of them, where the solution has names.
     """
     jones = solution.jones[:, channel]
     hours = (solution.term.slots_s - solution.term.slots_s[0]) / 3600
-    figure = Figure(figsize=(7.2, 8.0), layout="compressed")
+    figure = Figure(figsize=(7.2, 8.4), layout="constrained")
     grid = figure.subplots(2, 2, sharex=True, sharey=True)
     step = solution.interval_s / 3600
+    names = solution.term.stations or tuple(map(str, range(jones.shape[1])))
+    rows = np.arange(0, len(names), max(1, -(-len(names) // 12)))
     extent = (hours[0] - step / 2, hours[-1] + step / 2, jones.shape[1] - 0.5, -0.5)
     for k, receptor in enumerate("pq"):
         g = jones[:, :, k, k]
@@ -32,7 +36,8 @@ def gains(solution: Solution, channel: int = 0) -> Figure:
             size = np.where(np.isfinite(g).any(axis=0), np.abs(g), 0.0)  # 0: stations that have no solution at all
             amplitude = size / np.nanmedian(size, axis=0) - 1
             phase = np.rad2deg(np.angle(g * np.conj(g[:, :1])))
-        for ax, values, what in ((grid[0, k], amplitude, "amplitude"), (grid[1, k], phase, "phase (deg)")):
+        percent = "amplitude, less 1 (%)"
+        for ax, values, what in ((grid[0, k], 100 * amplitude, percent), (grid[1, k], phase, "phase (deg)")):
             good = values[np.isfinite(values)]
             high = float(np.percentile(np.abs(good), 99)) if good.size else 1.0
             drawn = ax.imshow(
@@ -45,9 +50,12 @@ def gains(solution: Solution, channel: int = 0) -> Figure:
                 interpolation="none",
             )
             ax.set_title(f"{receptor}: {what}")
-            figure.colorbar(drawn, ax=ax, fraction=0.05, pad=0.02)
-    figure.supxlabel("time since the first interval (h)", fontsize=13)
-    figure.supylabel("station", fontsize=13)
+            ax.set_facecolor("#bbbbbb")
+            figure.colorbar(drawn, ax=ax, fraction=0.05, pad=0.02).locator = MaxNLocator(5)
+    for ax in grid[:, 0]:
+        ax.set_yticks(rows, [names[k] for k in rows], fontsize=10)
+    for ax in grid[1]:
+        ax.set_xlabel("time (h)")
     return figure
 
 
@@ -60,6 +68,7 @@ def convergence(solution: Solution, ax: Axes | None = None) -> Axes:
     ax.semilogy(np.arange(1, len(history) + 1), shown, "o-", color=BLUE, ms=4, label="slowest interval")
     ax.axvline(float(np.median(solution.iterations)), color=GREY, ls="--", label="median interval stands still")
     ax.set(xlabel="iteration", ylabel="largest relative step")
+    ax.xaxis.set_major_locator(MaxNLocator(8, integer=True))
     ax.legend(frameon=False)
     return ax
 

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
+from matplotlib.patheffects import withStroke
 
 from instrument.errors import InputError
 from instrument.report.spectra import LOOKS, log_numbers
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 WEDGES = (2.0, 10.0, 90.0)  # deg from the phase centre; the last is the horizon
 NO_DATA = "#bbbbbb"
+HALO = [withStroke(linewidth=2.6, foreground="#333333")]  # white alone is lost on yellow
 
 
 @styled
@@ -86,10 +88,13 @@ def cylinder_ratio(
             keys.append(Line2D([], [], color=INK, ls=look, lw=2, label=f"ratio 1, {which}"))
         else:
             side = "below" if np.nanmax(level) < 1 else "above"
-            keys.append(Line2D([], [], ls="", label=f"{which}: all {side} 1"))
+            title += f"\n{which}: all {side} 1"  # no line to name in the legend
     if window.wedge.any():
         keys.append(Patch(fc="none", ec=INK, hatch="///", lw=0, label="wedge: not counted"))
-    ax.legend(handles=keys, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3, frameon=False, handlelength=1.6)
+    ax.set_title(title)
+    if keys:
+        below: Any = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.16), "ncols": 3, "frameon": False}
+        ax.legend(handles=keys, handlelength=1.6, **below)
     return ax
 
 
@@ -162,11 +167,15 @@ def _mesh(
         height = spectrum.frame.horizon_slope * np.sin(np.deg2rad(angle)) * line
         inside = (height > par[0]) & (height < par[-1])
         if inside.any():
-            ax.plot(line, height, color="white", lw=1.6, ls="-" if angle == 90 else "--")
+            ax.plot(line, height, color="white", lw=1.6, ls="-" if angle == 90 else "--", path_effects=HALO)
             at = int(np.flatnonzero(inside)[-1] * 0.8 + np.flatnonzero(inside)[0] * 0.2)
             name = "horizon" if angle == 90 else f"{angle:g}°"
-            ax.annotate(name, (line[at], height[at]), xytext=(-3, 3), textcoords="offset points", color="white",
-                        size=11, ha="right")  # fmt: skip
+            # a name to the left of its line would be cut by the left rim
+            side: Any = (
+                {"xytext": (-3, 3), "ha": "right"} if at > 20 else {"xytext": (5, -3), "ha": "left", "va": "top"}
+            )
+            ax.annotate(name, (line[at], height[at]), textcoords="offset points", color="white", size=11,
+                        path_effects=HALO, **side)  # fmt: skip
     for axis, (left, right) in ((ax.xaxis, (perp[0], perp[-1])), (ax.yaxis, (par[0], par[-1]))):
         log_numbers(axis, right / left)
     if title:

@@ -24,14 +24,16 @@ if TYPE_CHECKING:
     from instrument.analyze.sources.leakage import Leakage
 
 Kind = Literal["linear", "circular"]
+CROWD = 300  # sources not measured whose crosses would drown those that were
 
 
 @styled
 def bubbles(leakage: Leakage, centre: Direction | None = None, kind: Kind = "linear", ax: Axes | None = None) -> Axes:
     """Leakage of every source over the field: area and colour of a bubble are its % (G,), east is left.
 
-    Sources that are not measured (near a null, or too faint) are grey crosses. The range of colours ends at the 98th
-    percentile. `centre` is the phase centre; without it the source nearest to it must be within 0.01 deg of it.
+    Sources that are not measured (near a null, or too faint) are grey crosses, more than 300 of them faint dots. The
+    range of colours ends at the 98th percentile. `centre` is the phase centre; without it the source nearest to it must
+    be within 0.01 deg of it.
     """
     if kind not in ("linear", "circular"):
         raise InputError(f"kind = '{kind}' is not one of 'linear', 'circular'")
@@ -70,8 +72,10 @@ def bubbles(leakage: Leakage, centre: Direction | None = None, kind: Kind = "lin
     )
     drawn.set_label("measured")
     lost = ~shown
-    cross: Any = {"marker": "x", "color": GREY, "lw": 0.9, "zorder": 2}
-    ax.scatter(east[lost], north[lost], s=min(16, widest**2 / 4), label="not measured", **cross)
+    crowd: Any = {"marker": ".", "s": 3, "lw": 0, "alpha": 0.6}
+    cross: Any = {"marker": "x", "s": min(16, widest**2 / 4), "lw": 0.9}
+    look = crowd if lost.sum() > CROWD else cross
+    ax.scatter(east[lost], north[lost], color=GREY, zorder=2, label="not measured", **look)
     _bar(drawn, ax, bool((values[shown] > top).any()), unit)
 
     keys = [
@@ -113,7 +117,7 @@ def _legends(ax: Axes, keys: list[Line2D], lost: int) -> None:
     ax.add_artist(ax.legend(handles=keys, bbox_to_anchor=(0.5, -0.15), ncols=3, **below))
     if lost:
         text = f"not measured: near a null, or too faint ({lost})"
-        cross = Line2D([], [], ls="", marker="x", ms=4, color=GREY, label=text)
+        cross = Line2D([], [], ls="", marker="." if lost > CROWD else "x", ms=4, color=GREY, label=text)
         ax.legend(handles=[cross], bbox_to_anchor=(0.5, -0.23), **below)
 
 

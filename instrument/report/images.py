@@ -11,6 +11,7 @@ from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse, Rectangle
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
 from instrument.errors import InputError
@@ -20,6 +21,7 @@ from instrument.units import Float
 if TYPE_CHECKING:
     from instrument.image.cube import StokesCube
 
+FIT = "#ffe000"
 MOST = 600  # pixels of an image that are drawn along an axis: a panel has 350 of its own
 
 
@@ -99,12 +101,17 @@ def psf_image(cube: StokesCube, channel: int = 0, ax: Axes | None = None) -> Axe
         ax.contour(east, north, part, levels=[0.5], colors="white", linewidths=1.6, linestyles="--", zorder=3)
         keys.append(Line2D([], [], color="white", ls="--", lw=1.6, label="PSF at half maximum"))
     if fitted:
-        ax.add_patch(_ellipse((0, 0), cube, channel, 60, fill=False, ec="black", lw=1.8, zorder=2))
-        keys.append(Line2D([], [], color="black", lw=1.8, label=f"fitted Gaussian, {_size(cube, channel)}"))
+        # black, and white with it, are lost on the dark red of the main lobe
+        rim = [withStroke(linewidth=4.4, foreground="black")]
+        ax.add_patch(_ellipse((0, 0), cube, channel, 60, fill=False, ec=FIT, lw=2.2, zorder=2, path_effects=rim))
+        text = f"fitted Gaussian, {_size(cube, channel)}"
+        keys.append(Line2D([], [], color=FIT, lw=2.2, path_effects=rim, label=text))
     ax.set(xlabel="offset east (arcmin)", ylabel="offset north (arcmin)")
     ax.set_title(f"PSF, {cube.freq_hz[channel] / 1e6:.6g} MHz")
     if keys:
-        ax.legend(handles=keys, loc="lower left", facecolor="#a9a9a9", framealpha=0.9, edgecolor="none")
+        ax.legend(
+            handles=keys, loc="lower left", facecolor="#a9a9a9", framealpha=0.9, edgecolor="none", labelcolor="black"
+        )
     return ax
 
 

@@ -52,12 +52,16 @@ class Text:
 
 @dataclass(frozen=True)
 class Table:
-    """Column heads and rows of cells (text, numbers, `Cell`); it scrolls sideways in its own box."""
+    """Column heads and rows of cells (text, numbers, `Cell`); it scrolls sideways in its own box.
+
+    With `stack` every row is a small list of heads and values on a phone: for tables of few rows.
+    """
 
     kind: ClassVar[str] = "table"
     columns: Sequence[str]
     rows: Sequence[Sequence[Any]]
     caption: str = ""
+    stack: bool = False
 
     @property
     def body(self) -> list[list[Cell]]:
@@ -67,7 +71,8 @@ class Table:
     @classmethod
     def of(cls, table: Any, caption: str = "") -> Table:
         """An astropy table, units in the heads, 5 digits; above 2000 rows the rest is left out, as the caption says."""
-        heads = [f"{name} ({table[name].unit})" if table[name].unit else name for name in table.colnames]
+        units = {name: table[name].unit for name in table.colnames}
+        heads = [name.replace("_", " ") + (f" ({unit})" if unit else "") for name, unit in units.items()]
         columns = [getattr(table[name], "value", table[name])[:MOST_ROWS] for name in table.colnames]
         if len(table) > MOST_ROWS:
             caption = f"{caption} The first {MOST_ROWS} of {len(table)} rows.".strip()
@@ -82,6 +87,7 @@ class FigureEntry:
     caption: str
     alt: str = ""
     wide: bool = False
+    dark: str = ""  # the same for dark screens, as data
     source: str = ""  # this and the size are filled in by read
     size: tuple[int, int] = (0, 0)
 

@@ -66,8 +66,8 @@ def _cards(record: Mapping[str, Any]) -> list[Card]:
     if steps := record.get("stages"):
         seconds = [step["seconds"]["measured"] for step in steps.values()]
         parts = [record.get("plan", {}).get("engine"), record.get("machine", {}).get("workers")]
-        note = (f"engine {parts[0]}, {parts[1]} workers; " if all(parts) else "") + "without writing"
-        cards.append(Card("Wall time", duration(sum(seconds)), note))
+        workers = f"{parts[1]} worker{'' if parts[1] == 1 else 's'}"
+        cards.append(Card("Wall time", duration(sum(seconds)), f"engine {parts[0]}, {workers}" if all(parts) else ""))
     return cards
 
 
@@ -81,7 +81,7 @@ def _checks(record: Mapping[str, Any]) -> list[Block]:
             seen = ", ".join(f"{n} {of}/{all_}" for n, (of, all_) in check.get("seen", {}).items())
             name = f"prediction, {check['samples']} visibilities against the definition" + (seen and f" ({seen})")
         else:
-            found, wanted = "; ".join(dict.fromkeys(check.get("outcome", ()))), ""
+            found, wanted = _found_and_wanted(name, "; ".join(dict.fromkeys(check.get("outcome", ()))))
         rows.append([name, found, wanted, _mark(check.get("passed", True))])
         if "flux_in_jy" in check:
             given, seen = check["flux_in_jy"], check["flux_out_jy"]
@@ -89,7 +89,17 @@ def _checks(record: Mapping[str, Any]) -> list[Block]:
             rows.append(
                 ["flux of all sources", f"{number(seen, 4)} Jy {share}", f"{number(given, 4)} Jy in the sky", ""]
             )
-    return [Table(["check", "found", "expected", "verdict"], rows)] if rows else []
+    return [Table(["check", "found", "expected", "verdict"], rows, stack=True)] if rows else []
+
+
+def _found_and_wanted(name: str, text: str) -> tuple[str, str]:
+    """The two halves of what a check says: what was found, and what it may be."""
+    found, comma, most = text.partition(", at most ")
+    if comma:
+        most, comma, rest = most.partition(",")
+        return found + comma + rest, f"at most {most}"
+    wanted = {"removal": "converged, and no worse than before", "RM-CLEAN": "every spectrum done"}
+    return text, wanted.get(name, "converged") if text not in ("", "not made") else ""
 
 
 def _stages(record: Mapping[str, Any]) -> list[Block]:
@@ -101,6 +111,12 @@ def _stages(record: Mapping[str, Any]) -> list[Block]:
         wrong.setdefault("predict", f"{check['error']:.1e} measured, {check['bound']:.1e} at most, of the total flux")
     if check := checks.get("photometry"):
         wrong.setdefault("photometry", "; ".join(dict.fromkeys(check["outcome"])))
+    if summary := record.get("calibration", {}).get("summary"):
+        wrong.setdefault("calibrate", summary)
+    if check := checks.get("solutions"):
+        wrong.setdefault("calibrate", "; ".join(check["outcome"]))
+    for name in ("plan", "verify"):
+        wrong.setdefault(name, "changes nothing")
     took = {name: step["seconds"]["measured"] for name, step in steps.items()}
     longest, parts = max(took.values()) or 1.0, record.get("parts", {})
     rows: list[list[Any]] = []
@@ -114,8 +130,8 @@ def _stages(record: Mapping[str, Any]) -> list[Block]:
         for part, t in sorted(inside.items(), key=lambda item: -item[1]):
             label = f"\u2003{part}".replace(" ", "\u00a0")
             rows.append([label, Cell(duration(t), bar=t / longest), "", "", "", wrong.get(part, "")])
-    heads = ["stage", "time", "planned", "memory", "planned", "how wrong it may be"]
-    blocks: list[Block] = [Table(heads, rows)]
+    heads = ["stage", "time", "time planned", "memory", "memory planned", "how wrong it may be"]
+    blocks: list[Block] = [Table(heads, rows, stack=True)]
     if (memory := record.get("memory")) and memory["planned_bytes"]:
         blocks.append(
             Text(

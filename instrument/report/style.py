@@ -12,6 +12,7 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from instrument.report.night import night
 from instrument.report.page import FigureEntry
 from instrument.whole_file import whole_file
 
@@ -47,19 +48,28 @@ def axes_of(ax: Axes | None, size: tuple[float, float]) -> Axes:
 
 
 def drawer(folder: Path) -> Callable[..., FigureEntry]:
-    """A function (name, drawing, caption, wide) that writes a figure into a folder and gives the entry of its page."""
+    """A function (name, drawing, caption, wide) that writes a figure into a folder and gives the entry of its page.
+
+    The page shows it in the colours of the night too, where the reader's screen asks for them.
+    """
 
     def draw(name: str, drawing: Figure | Axes, caption: str, wide: bool = False) -> FigureEntry:
-        return FigureEntry(save(drawing, folder / f"{name}.png"), caption, wide=wide)
+        path = save(drawing, folder / f"{name}.png")
+        return FigureEntry(path, caption, wide=wide, dark=night(figure_of(drawing)))
 
     return draw
 
 
-def save(drawing: Figure | Axes, path: str | os.PathLike[str]) -> Path:
-    """Write a figure, or the one that axes belong to, as PNG of 150 dots an inch; the file is whole or not there."""
+def figure_of(drawing: Figure | Axes) -> Figure:
+    """A figure, or the one that axes belong to."""
     figure: Any = drawing if isinstance(drawing, Figure) else drawing.figure
     while not isinstance(figure, Figure):  # axes of a subfigure
         figure = figure.figure
+    return figure
+
+
+def save(drawing: Figure | Axes, path: str | os.PathLike[str]) -> Path:
+    """Write a figure, or the one that axes belong to, as PNG of 150 dots an inch; the file is whole or not there."""
     with whole_file(path) as partial:
-        figure.savefig(partial, format="png", dpi=150, bbox_inches="tight", facecolor="white")
+        figure_of(drawing).savefig(partial, format="png", dpi=150, bbox_inches="tight", facecolor="white")
     return Path(path)

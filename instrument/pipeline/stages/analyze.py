@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 
+import numpy as np
+
 from instrument.analyze.analyzer import Analyzer
 from instrument.analyze.power.fourier import check_redshift
 from instrument.analyze.power.spectra import Spectrum2D
@@ -19,7 +21,7 @@ from instrument.pipeline.stages.image import Image, ImageResult
 from instrument.pipeline.stages.leakage import EXPECTED_JONES, LeakageRun
 from instrument.pipeline.work import Items, StageWork
 from instrument.plan import Item
-from instrument.report.page import Figures, Section
+from instrument.report.page import Figures, Section, Text
 from instrument.scene import Scene
 from instrument.units import Count, UvRange
 from instrument.visibilities import Visibilities
@@ -138,6 +140,8 @@ class SpectraResult(StageResult):
         """The spectra in one figure."""
         from instrument.report.spectra import spectra_2d
 
+        if not any((np.nan_to_num(s.power) > 0).any() for s in self.spectra.values()):
+            return [Section("Power spectra of the images", [Text("The images have no power to draw.")])]
         text = "2D power spectra of the images, Hann taper; the PSF stays."
         return [
             Section("Power spectra of the images", [Figures([draw("spectrum_2d", spectra_2d(self.spectra), text)])])

@@ -12,7 +12,7 @@ import numpy as np
 from instrument.analyze.analyzer import Analyzer
 from instrument.calibrate.als import LANES
 from instrument.calibrate.base import Calibrator, Solution
-from instrument.calibrate.di_errors import DIComparison, DISums
+from instrument.calibrate.di_errors import NAMES, DIComparison, DISums
 from instrument.calibrate.selfcal import SelfCal
 from instrument.component import KIND, Component
 from instrument.errors import InputError, Outcome, did_you_mean
@@ -25,7 +25,7 @@ from instrument.pipeline.stage import Beside, Draw, Running, Stage, StageResult,
 from instrument.pipeline.stages.image import Image, imaging
 from instrument.pipeline.work import StageWork
 from instrument.registry import load, names
-from instrument.report.page import Block, Card, Figures, Section, Table, Text, number
+from instrument.report.page import Block, Card, Figures, Mark, Section, Table, Text, number
 from instrument.units import Float
 from instrument.visibilities import Visibilities
 from instrument.whole_file import write_ecsv
@@ -155,6 +155,8 @@ class _CalibrateRun(StageRun):
 class CalibrationResult(StageResult):
     """Solutions of a run, how they compare with the truth, images of what they leave, and rms of visibilities."""
 
+    leading: ClassVar[bool] = True
+
     solution: Solution
     errors: DIComparison | None
     cubes: dict[str, StokesCube]
@@ -197,13 +199,19 @@ class CalibrationResult(StageResult):
         }
 
     def cards(self) -> list[Card]:
-        """How many intervals converged, and what calibration leaves."""
+        """How many intervals converged, how far the solutions are from the truth, and what calibration leaves."""
         done = self.solution.converged
-        left = number(100 * self.rms["corrected - model"] / self.rms["model"]) if self.rms["model"] else "–"
-        return [
-            Card("Converged", f"{int(done.sum())} of {done.size}", "intervals", "good" if self.passed else "bad"),
-            Card("Left by calibration", f"{left} %", "corrected less model, of the visibility rms"),
-        ]
+        mark: Mark = "good" if self.passed else "bad"
+        cards = [Card("Intervals converged", f"{int(done.sum())} of {done.size}", "", mark)]
+        if self.errors is not None:
+            apart = max(self.errors.linear.get("difference, aligned", {}).values(), default=np.nan)
+            if np.isfinite(apart):
+                text = "of the rms put in: the worst of the seven parameters, the unitary freedom taken out"
+                cards.append(Card("Errors not found", f"{number(float(apart))}\u00a0%", text))
+        if self.rms["model"]:
+            left = f"{number(100 * self.rms['corrected - model'] / self.rms['model'])}\u00a0%"
+            cards.append(Card("Left by calibration", left, "corrected less model, of the visibility rms"))
+        return cards
 
     def sections(self, draw: Draw) -> list[Section]:
         """Errors of the solutions, gains against time, how it converged, and what is left."""
@@ -214,12 +222,20 @@ class CalibrationResult(StageResult):
         blocks: list[Block] = [Text(str(solution))]
         if self.errors is not None:
             text = "The seven direction-independent error parameters, in % of the rms put in."
-            blocks.append(Table.of(self.errors.table(), text))
-        entries = [
-            draw("gains", gains(solution), "Solved gains of every station against time; white: no solution."),
-            draw("convergence", convergence(solution), "How the solve converged: the slowest interval."),
-            draw("residual", residuals(solution), "What the solutions leave of the data they were solved from."),
-        ]
+            made = Table.of(self.errors.table(), text)
+            heads = [made.columns[0], *(f"{name.upper()} (%)" for name in NAMES)]
+            blocks.append(replace(made, columns=heads))
+        if not np.isfinite(solution.jones).any():
+            blocks.append(Text("No interval has a solution, so there is nothing to draw."))
+            return [Section("Calibration", blocks)]
+        text = "Solved gains of every station against time: amplitude over its median, less 1, and phase; grey: none."
+        entries = [draw("gains", gains(solution), text)]
+        if (solution.history > 0).any():
+            text = "How the solve converged: the slowest interval."
+            entries.append(draw("convergence", convergence(solution), text))
+        if np.isfinite(solution.residual).any():
+            text = "What the solutions leave of the data they were solved from."
+            entries.append(draw("residual", residuals(solution), text))
         if self.cubes:
             text = "2D power spectra of what calibration leaves in the images, Hann taper; the PSF stays."
             entries.append(draw("calibration_spectra", spectra_2d(self.spectra()), text))

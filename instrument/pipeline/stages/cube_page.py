@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 
 from instrument.analyze.faraday.cube import FaradayCube
@@ -9,7 +11,7 @@ from instrument.analyze.ixr import removal_table
 from instrument.analyze.power.signal import Signal21cm
 from instrument.pipeline.stage import Draw
 from instrument.pipeline.stages.cube_results import CubeProducts
-from instrument.report.page import Block, Figures, Section, Table, Text, number
+from instrument.report.page import Block, Details, Figures, Section, Table, Text, number
 from instrument.units import Float
 
 
@@ -66,6 +68,8 @@ def _faraday(result: CubeProducts, figure: Draw) -> Section | None:
                 "edges, and most of it is missing."
             )
         )
+    if not np.nan_to_num(found.data).any():
+        return Section("Faraday depth", [*blocks, Text("There is no polarized emission in the cube to draw.")])
     y, x = result.brightest
     line = lines_of_sight(result.sights)
     line.set_title(f"pixel ({x}, {y}), the brightest")
@@ -108,7 +112,7 @@ def _spectra(result: CubeProducts, figure: Draw) -> Section | None:
         models = [Signal21cm.table(result.settings.signal)] if in_kelvin else []
         text = "Spherical power spectra" + (" and the 21-cm signal." if in_kelvin else ".")
         entries.append(figure("spherical", spheres(result.spheres, models), text))
-    if result.planes:
+    if any(np.nan_to_num(plane.power).any() for plane in result.planes.values()):
         entries.append(figure("spectrum_2d", spectra_2d(result.planes), "2D power spectra of the middle channel."))
     if not entries:
         return None
@@ -134,8 +138,10 @@ def _window(result: CubeProducts, figure: Draw) -> Section | None:
     blocks: list[Block] = []
     entries = []
     for name, window in result.windows.items():
-        title = f"{name[0].upper()}{name[1:]}:\n" if name else ""
-        blocks.append(Text(f"{title}{window}", code=True))
+        said, *rest = str(window).splitlines()
+        blocks.append(Text(f"{name[0].upper()}{name[1:]}. {said}" if name else said))
+        rows = [re.split(r"\s{2,}", line, maxsplit=1) for line in rest]
+        blocks.append(Table(["", ""], [row if len(row) == 2 else [*row, ""] for row in rows], stack=True))
         file = f"window{'_' if name else ''}{name.replace(' ', '_')}"
         text = "Power of Stokes I, taken as leakage, over that of the 21-cm signal" + (f", {name}." if name else ".")
         if window.counts.any():
@@ -143,6 +149,7 @@ def _window(result: CubeProducts, figure: Draw) -> Section | None:
             entries.append(figure(file, drawn, text))
     columns = ("removed_percent", "leakage_percent", "power_left", "ixr_m_db", "ixr_j_db")
     heads = ["leakage removed (%)", "leakage left (%)", "power left", "IXR_M (dB)", "IXR_J (dB)"]
-    rows = [[float(row[name]) for name in columns] for row in removal_table()]
-    table = Table(heads, rows, "What a station of 25 dB is as good as when part of its leakage is removed.")
-    return Section("EoR window", [*blocks, Figures(entries), table])
+    worth = [[float(row[name]) for name in columns] for row in removal_table()]
+    table = Table(heads, worth, "The same for every scene: arithmetic, nothing of it was measured in this run.")
+    rule = Details("Not measured: what any station of 25 dB is worth when part of its leakage is removed", [table])
+    return Section("EoR window", [*blocks, *([Figures(entries)] if entries else []), rule])

@@ -134,11 +134,17 @@ class CubeProducts(StageResult):
         return {"checks": found.pop("checks"), "stage_errors": found.pop("stage_errors"), "cube": found}
 
     def cards(self) -> list[Card]:
-        """How far each window is open."""
-        return [
-            Card(f"EoR window, {name or 'as it is'}", f"{number(100 * window.area()[1])} %", "of the area of the bins")
+        """How far each window is open, and in how many pixels there is a significant Faraday peak."""
+        cards = [
+            Card(f"EoR window open, {name or 'as it is'}", f"{number(share)}\u00a0%", "of the area of the bins")
             for name, window in self.windows.items()
+            if np.isfinite(share := 100 * window.area()[1])
         ]
+        if self.peaks is not None:
+            share = 100 * float(np.mean(self.peaks.significant))
+            text = f"of the pixels, above {self.peaks.snr_min:g} times the noise"
+            cards.append(Card("Faraday depth found", f"{number(share)}\u00a0%", text))
+        return cards
 
     def figures(self) -> dict[str, Any]:
         """Settings, what was left out, checks, and the numbers of every product."""

@@ -21,9 +21,9 @@ from instrument.pipeline.stage import Beside, Draw, Running, Stage, StageResult,
 from instrument.pipeline.work import Items, StageWork
 from instrument.plan import Item, count_of
 from instrument.registry import load, names
-from instrument.report.page import Card, Figures, Section, Table, number
+from instrument.report.page import Card, Figures, Section, Table, Text, number
 from instrument.scene import Scene
-from instrument.units import si_prefix
+from instrument.units import Float, si_prefix
 from instrument.visibilities import Visibilities
 
 # seconds of a visibility on two cores: gridded in one plane; picked out, with its Stokes parameters
@@ -62,7 +62,7 @@ class Image(Stage):
 
     def work(self, run: Running) -> StageWork:
         """That of images of all channels."""
-        return imaging(self.imager, run)._replace(figures=2)
+        return imaging(self.imager, run)._replace(figures=1 + min(3, run.plan.problem.shape[1]))
 
     def items(self, run: Running) -> Items:
         """Baselines outside the uv range of the images, in the share of all."""
@@ -167,12 +167,28 @@ class ImageResult(StageResult):
         return [Card("PSF", f"{major}′ × {minor}′", "width at half maximum")]
 
     def sections(self, draw: Draw) -> list[Section]:
-        """Images of the first channel, the PSF, and the rms of each Stokes parameter."""
+        """Images of the first, middle and last channel, the PSF, and the rms of each Stokes parameter in them."""
         from instrument.report.images import psf_image, stokes_images
 
-        entries = [draw("images", stokes_images(self.cube), "Images of the four Stokes parameters.", wide=True)]
+        count = len(self.cube.freq_hz)
+        shown = {name: k for k, name in {0: "first", count // 2: "middle", count - 1: "last"}.items()}
+        rms = {name: np.array([_rms(self.cube.data[k, s]) for s in range(4)]) for name, k in shown.items()}
+        if not any(np.isfinite(values).any() for values in rms.values()):
+            return [Section("Images", [Text("The images have no data: every visibility is flagged or left out.")])]
+        entries = []
+        for name, k in shown.items():
+            text = "Images of the four Stokes parameters" + (f", {name} of {count} channels." if count > 1 else ".")
+            file = "images" if k == 0 else f"images_{name}"
+            entries.append(draw(file, stokes_images(self.cube, k), text, wide=count == 1))
         if self.cube.psf is not None and self.cube.psf.data is not None:
             text = "Point spread function and the Gaussian fitted to its main lobe."
             entries.append(draw("psf", psf_image(self.cube), text))
-        rms = [[stokes, number(value)] for stokes, value in self.record()["image"]["rms"].items()]
-        return [Section("Images", [Figures(entries), Table(["Stokes", f"rms ({self.cube.unit})"], rms)])]
+        heads = [f"{self.cube.freq_hz[k] / 1e6:.6g} MHz" for k in shown.values()]
+        rows = [[stokes, *(float(values[s]) for values in rms.values())] for s, stokes in enumerate("IQUV")]
+        text = f"Rms of the images, {self.cube.unit}."
+        return [Section("Images", [Figures(entries), Table(["Stokes", *heads], rows, text)])]
+
+
+def _rms(plane: Float) -> float:
+    good = plane[np.isfinite(plane)]
+    return float(np.std(good)) if good.size else float("nan")

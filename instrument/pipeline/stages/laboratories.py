@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
+import numpy as np
+
 from instrument.calibrate.directional import DirectionalCal
 from instrument.component import KIND, Component
 from instrument.errors import InputError
@@ -22,7 +24,7 @@ from instrument.pipeline.stages.image import imaging
 from instrument.pipeline.stages.noise import STEP, Noise
 from instrument.pipeline.work import StageWork
 from instrument.planner import BLOCK_BYTES
-from instrument.report.page import Card, Details, Figures, Section, Table, Text, number
+from instrument.report.page import Block, Card, Details, Figures, Section, Table, Text, number
 from instrument.visibilities import Visibilities
 
 DIRECTIONAL = 2.5e-6  # seconds of a visibility and a pair of directions, solved for all directions at once
@@ -99,6 +101,7 @@ class ManyDirectionsStage(Stage):
             f"solves of {problem.at.shape[2]} stations in {lab.clusters} directions",
             seconds=solves + solving(lab.calibrator.tolerance, run).seconds + 1.3 * run.plan.seconds,
             block_bytes=run.plan.memory + 5 * BLOCK_BYTES,
+            figures=1,
         )
 
     def start(self, run: Running) -> StageRun:
@@ -128,6 +131,7 @@ class _Alone(StageRun):
 class _Found(StageResult):
     """What a laboratory has found, told in its own words."""
 
+    leading: ClassVar[bool] = True
     found: Any  # with `passed`, `lines()` and `write(folder)`
 
     @property
@@ -155,6 +159,18 @@ class SweepResult(_Found):
 
     found: Sweep
 
+    def cards(self) -> list[Card]:
+        """What the largest model leaves, and what it takes of the sources that are not in it."""
+        found, n = self.found, self.found.models[-1]
+        last = found.table()[-1]
+        known = f"with {n} of {found.sources} sources in the model"
+        told = (
+            ("Left of the visibilities", last["visibility_rms"].value, "%", f"of their rms, {known}"),
+            ("Flux lost, not in the model", 100 * (1 - last["suppression"]), "%", f"of those sources, {known}"),
+            ("Flux wrong", last["bright_flux_median"].value, "%", f"median of the {found.bright} brightest, {known}"),
+        )
+        return [Card(label, f"{number(float(x))}\u00a0{unit}", note) for label, x, unit, note in told if np.isfinite(x)]
+
     def sections(self, draw: Draw) -> list[Section]:
         """Errors against the size of the model."""
         from instrument.report.laboratory import errors_against_model
@@ -167,8 +183,19 @@ class SweepResult(_Found):
             curves = {f"left with {n} in the model" if n else "true image": curve for n, curve in made}
             text = "2D power spectra of the images, Hann taper; the PSF stays."
             entries.append(draw("spectrum_2d", spectra_2d(curves), text))
+        names = ("n", "flux_share", "visibility_rms", "image_rms", "bright_flux_median", "bright_shift_median",
+                 "unmodelled_flux_median", "unmodelled_shift_median")  # fmt: skip
+        heads = ["sources in the model", "of the flux (%)", "left of visibilities (%)", "left of the image (%)",
+                 "flux error, brightest (%)", "position error, brightest (″)", "flux error, others (%)",
+                 "position error, others (″)"]  # fmt: skip
+        rows = [[getattr(row[name], "value", row[name]) for name in names] for row in self.found.table()]
+        text = "Rms left over the rms of data or image; medians of errors. Others: sources not in the model."
+        return [Section("Incomplete models", [Table(heads, rows, text, True), Figures(entries)])]
+
+    def tables(self) -> list[Section]:
+        """All that was measured, one row a model."""
         rows = Table.of(self.found.table(), "One row a model of the n brightest sources.")
-        return [Section("Incomplete models", [Figures(entries), rows])]
+        return [Section("All models", [Details(f"{len(self.found.models)} models, all that was measured", [rows])])]
 
 
 @dataclass(frozen=True)
@@ -186,8 +213,26 @@ class SubtractionResult(_Found):
         ]
 
     def sections(self, draw: Draw) -> list[Section]:
-        """Clusters, and what is left, in words."""
-        return [Section("Many directions", [Text("\n".join(self.found.lines()), code=True)])]
+        """What is left of each cluster, drawn and as a table, and of the whole, in words."""
+        from instrument.report.laboratory import left_of_clusters
+
+        found = self.found
+        heads = ["cluster", "sources", "flux (Jy)", "error of its matrices", "intervals failed (%)"]
+        rows = [
+            [name, int(n), float(flux), float(error), 100 * float(failed)]
+            for name, n, flux, error, failed in zip(
+                found.names, found.sources, found.flux_jy, found.error, found.failed, strict=True
+            )
+        ]
+        blocks: list[Block] = []
+        if found.apart_jy is not None and (np.nan_to_num(found.apart_jy) > 0).any():
+            rows = [[*row, *map(float, apart)] for row, apart in zip(rows, found.apart_jy.T, strict=True)]
+            heads += ["left of it (Jy)", "left with one direction (Jy)"]
+            text = "Rms of what is left of each cluster: solved in its own direction, and with one direction for all."
+            blocks.append(Figures([draw("many_directions", left_of_clusters(found), text)]))
+        said = [" ".join(line.split()) for line in found.lines()[len(found.names) + 1 :]]
+        texts = [Text(f"{line[0].upper()}{line[1:]}.") for line in said]
+        return [Section("Many directions", [*texts, *blocks, Table(heads, rows, stack=True)])]
 
     def tables(self) -> list[Section]:
         """The table of clusters with all that was measured."""

@@ -16,7 +16,7 @@ from instrument.errors import InputError, Outcome
 from instrument.observe.sampling import Sampling
 from instrument.pipeline.stage import Draw, Running, StageResult, StageRun
 from instrument.plan import Plan
-from instrument.report.page import Block, Card, Details, Figures, Section, Table, number
+from instrument.report.page import Block, Card, Details, Figures, Section, Table, Text, number
 from instrument.sky.points import points_of
 from instrument.units import Direction, Float
 from instrument.visibilities import Visibilities
@@ -143,15 +143,20 @@ class LeakageResult(StageResult):
     def cards(self) -> list[Card]:
         """Sources and leakage within 4 deg."""
         found = self.record()["leakage"]
-        if not (inside := found["inside_4_deg"]):
-            return []
-        note = f"left out in the whole field: {found['near_null']} near a null, {found['too_faint']} too faint"
-        cards = [Card("Sources in 4°", str(inside["sources"]), note)]
+        inside = found["inside_4_deg"]
+        if not inside["sources"]:
+            return [Card("Sources measured in 4°", "none", self._left_out())]
+        note = f"left out in the whole field: {self._left_out()}"
+        cards = [Card("Sources measured in 4°", str(inside["sources"]), note)]
         for kind in ("linear", "circular"):
             median, most = (number(inside[f"{kind}_{what}"]) for what in ("median", "max"))
             text = f"median; at most {most}\u00a0%"
             cards.append(Card(f"{kind.capitalize()} leakage in 4°", f"{median}\u00a0%", text))
         return cards
+
+    def _left_out(self) -> str:
+        near = int(self.leakage.near_null.sum())
+        return f"{near} near a null, {int((~self.leakage.measured).sum()) - near} too faint"
 
     def sections(self, draw: Draw) -> list[Section]:
         """Leakage by distance, over the field, and beside the beam model."""
@@ -165,7 +170,10 @@ class LeakageResult(StageResult):
                 for r in rings
             ]
             heads = ["distance (deg)", "sources", "I→P median (%)", "I→P max (%)", "I→V median (%)", "I→V max (%)"]
-            blocks.append(Table(heads, rows, "P is sqrt(Q² + U²); both in % of the apparent I of the source."))
+            blocks.append(Table(heads, rows, "P is sqrt(Q² + U²); both in % of the apparent I of the source.", True))
+        if not self.leakage.measured.any():
+            blocks.append(Text(f"None of the {len(self.leakage.names)} sources was measured: {self._left_out()}."))
+            return [Section("Leakage by distance", blocks)]
         entries = []
         for kind, what in PLANES:
             text = (
