@@ -21,7 +21,7 @@ from instrument.units import Float
 if TYPE_CHECKING:
     from instrument.image.cube import StokesCube
 
-FIT = "#ffe000"
+FIT, HALF = "#ffe000", "#0026ff"
 MOST = 600  # pixels of an image that are drawn along an axis: a panel has 350 of its own
 
 
@@ -98,10 +98,10 @@ def psf_image(cube: StokesCube, channel: int = 0, ax: Axes | None = None) -> Axe
     north = low + (np.arange(part.shape[0]) + 0.5) * pixel
     keys = []
     if np.nanmax(part) > 0.5:
-        ax.contour(east, north, part, levels=[0.5], colors="white", linewidths=1.6, linestyles="--", zorder=3)
-        keys.append(Line2D([], [], color="white", ls="--", lw=1.6, label="PSF at half maximum"))
+        ax.contour(east, north, part, levels=[0.5], colors=HALF, linewidths=1.4, linestyles="--", zorder=3)
+        keys.append(Line2D([], [], color=HALF, ls="--", lw=1.4, label="PSF at half maximum"))
     if fitted:
-        # black, and white with it, are lost on the dark red of the main lobe
+        # black is lost on the dark red of the main lobe, white on the line below where the two agree
         rim = [withStroke(linewidth=4.4, foreground="black")]
         ax.add_patch(_ellipse((0, 0), cube, channel, 60, fill=False, ec=FIT, lw=2.2, zorder=2, path_effects=rim))
         text = f"fitted Gaussian, {_size(cube, channel)}"

@@ -57,7 +57,7 @@ def _faraday(result: CubeProducts, figure: Draw) -> Section | None:
         ["FWHM: 2 sqrt(3) / width, 3.8 / width", f"{number(band.fwhm_nominal)}, {number(band.fwhm_sinc)} rad/m²"],
         ["largest depth, sqrt(3) / channel", f"{number(band.phi_max)} rad/m²"],
         ["largest scale, pi / shortest wavelength²", f"{number(band.max_scale)} rad/m²"],
-        ["lambda_0²", f"{number(found.lambda2_0)} m²"],
+        ["reference wavelength²", f"{number(found.lambda2_0)} m²"],
         ["pixels with a significant peak", f"{int(peaks.significant.sum())}, above {peaks.snr_min:g} times the noise"],
     ]
     blocks: list[Block] = [Table(["what", "value"], rows)]
