@@ -60,7 +60,8 @@ def test_a_stage_of_a_stranger_works_from_a_scene_file_in_the_plan_and_in_the_re
     record = json.loads((tmp_path / "out" / "run.json").read_text())
     assert record["flagged"] == dict.fromkeys(["CS001HBA0", "CS003HBA1", "CS302HBA1", "RS106HBA"], 0.0)
     assert record["scene"]["flagged"] == {"most": 0.2} and record["stages"]["flagged"]["seconds"]["measured"] >= 0
-    assert "<td>flagged</td>" in re.sub(r"<td[^>]*>", "<td>", (tmp_path / "out" / "report.html").read_text())
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "<td>flagged</td>" in re.sub(r"<td[^>]*><span>(.*?)</span></td>", r"<td>\1</td>", page)
     wrong = command(strangers, tmp_path, "run", "mock-grid", *words, "--set", "flagged.mots=1")
     assert wrong.returncode == 2 and wrong.stderr.count("\n") == 1
     assert "[flagged] Flagged has no 'mots': did you mean 'most'" in wrong.stderr
