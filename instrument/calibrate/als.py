@@ -16,7 +16,6 @@ from instrument.phasor import FAST
 from instrument.units import Float
 
 LANES = 16
-PATTERNS = {"full": 0, "diagonal": 1, "scalar": 2, "phase": 3}
 
 
 @numba.njit(inline="always")
