@@ -29,7 +29,7 @@ from instrument.units import si_prefix
 
 HALVINGS = 12  # of blocks until the run fits
 LIBRARIES = 60e6  # bytes of compiled loops and of the libraries that stages load at their first block
-PAGE_BYTES, PAGE_SECONDS, FIGURE_SECONDS = 90e6, 1.0, 0.7  # matplotlib and jinja2 loaded; a figure, day and night
+PAGE_BYTES, PAGE_SECONDS, FIGURE_SECONDS = 170e6, 1.0, 0.7  # matplotlib and jinja2 loaded; a figure, day and night
 
 
 def plan_run(file: SceneFile, scene: Scene, memory: Any = None, workers: int | None = None) -> RunPlan:
