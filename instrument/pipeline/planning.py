@@ -29,7 +29,7 @@ from instrument.units import si_prefix
 
 HALVINGS = 12  # of blocks until the run fits
 LIBRARIES = 60e6  # bytes of compiled loops and of the libraries that stages load at their first block
-PAGE_BYTES, PAGE_SECONDS, FIGURE_SECONDS = 170e6, 1.0, 0.7  # matplotlib and jinja2 loaded; a figure, day and night
+PAGE_BYTES, PAGE_SECONDS, FIGURE_SECONDS = 120e6, 0.8, 0.7  # matplotlib and jinja2 loaded; a figure, day and night
 
 
 def plan_run(file: SceneFile, scene: Scene, memory: Any = None, workers: int | None = None) -> RunPlan:
@@ -66,7 +66,7 @@ def whole(file: SceneFile, scene: Scene, plan: Plan) -> RunPlan:
     run = Running(file.name, file.seed, scene.instrument, plan, file.running)
     works = {} if file.alone else {PREDICT: predicting(plan)}
     if any(stage.perfect for stage in file.running.values()):
-        works[RECEIVERS] = copies(run.visibilities, run.block, 2.0, 0.35e-6, "their errors put into the blocks")
+        works[RECEIVERS] = copies(run.visibilities, run.block, 2.0, 0.55e-6, "their errors put into the blocks")
     items = {}
     for name, stage in file.running.items():
         works[name], items[name] = stage.work(run), stage.items(run)

@@ -20,12 +20,12 @@ def photometry(settings: ForcedPhotometry, run: Running, jones: float) -> StageW
     stations, sources = problem.at.shape[2:]
     slots = channels * -(-times // settings.every)
     wide = sources + PLACES
-    product = 8.0 * stations**2 * wide / 1.5e10
+    product = 8.0 * stations**2 * wide / 2.5e10
     fringes = 3e-9 * stations * wide
     each = fringes + 4 * product + 2e-7 * baselines + 3e-4
     full = sources <= MOST_DIRECT
     plain = full and settings.uv_range is None
-    last = slots * (fringes + 4.0 * stations * sources * wide / 1.5e10 + 2e-9 * sources * wide) if plain else 0.0
+    last = slots * (fringes + 4.0 * stations * sources * wide / 2.5e10 + 2e-9 * sources * wide) if plain else 0.0
     if not plain:
         last = TURNS * slots * (2 * fringes + 8 * product)
         last += min(PRODUCTS, 1.0 * slots * baselines * sources**2) / 1.2e10 if full else 0.0
@@ -34,7 +34,7 @@ def photometry(settings: ForcedPhotometry, run: Running, jones: float) -> StageW
     return StageWork(
         f"fluxes of {sources} sources",
         seconds=slots * each,
-        finish_seconds=last + solve + 1.2e-6 * matrices,
+        finish_seconds=last + solve + 0.65e-6 * matrices,
         held_bytes=slots * (24.0 * stations + 8 * 4 * PLACES + 600 + (0 if plain else 8.0 * baselines)),
         block_bytes=16.0 * 2 * stations * wide + 64.0 * 4 * baselines,
         finish_bytes=max(

@@ -33,6 +33,7 @@ from instrument.whole_file import write_ecsv
 IMAGES = ("corrupted", "corrected", "corrupted - corrected", "corrected - model")
 
 SOLVE = 0.12e-6  # seconds of a visibility for each decade of tolerance
+COMPARING, MAKING = 2.1e-6, 0.3e-6  # seconds of a visibility: errors beside the truth; another block to look at
 KEPT = 300.0  # bytes of a station and interval: solutions, and what the comparison with the truth makes of them
 SOLVING = 600.0  # bytes of a baseline in each vector lane
 
@@ -75,9 +76,10 @@ class Calibrate(Stage):
         image = run.stage("image", Image)
         drawn = StageWork() if image is None else imaging(image.imager, run, len(IMAGES))
         solved = solving(self.calibrator.tolerance, run)
+        made = run.visibilities * (len(IMAGES) * MAKING + (COMPARING if run.instrument.errors() else 0.0))
         return drawn._replace(
             does="; ".join(text for text in (solved.does, drawn.does) if text),
-            seconds=drawn.seconds + solved.seconds,
+            seconds=drawn.seconds + solved.seconds + made,
             held_bytes=drawn.held_bytes + solved.held_bytes,
             block_bytes=drawn.block_bytes + solved.block_bytes,
             result_bytes=drawn.result_bytes + solved.held_bytes,

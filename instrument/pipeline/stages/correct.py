@@ -29,7 +29,7 @@ class Correct(Stage):
         """Matrices of the stations on both sides of every visibility."""
         if not run.instrument.chain().beams().parts:
             return StageWork("no beam to take out")
-        return copies(run.visibilities, run.block, 3.0, 0.3e-6, "the beam towards the phase centre taken out")
+        return copies(run.visibilities, run.block, 3.0, 0.4e-6, "the beam towards the phase centre taken out")
 
     def start(self, run: Running) -> StageRun:
         """The stage at work."""

@@ -27,7 +27,8 @@ from instrument.units import Float, si_prefix
 from instrument.visibilities import Visibilities
 
 # seconds of a visibility on two cores: gridded in one plane; picked out, with its Stokes parameters
-GRIDDING, PICKING = 0.9e-6, 0.3e-6
+GRIDDING, PICKING = 0.45e-6, 0.3e-6
+TURNING = 4e-7  # seconds of a pixel for each call of the gridder: its transforms
 KEEPING = 2e-6  # seconds of a visibility that is kept in a file, read and imaged
 GRIDDED = 250.0  # bytes of a visibility while it is gridded
 
@@ -95,8 +96,9 @@ def imaging(imager: AnyImager, run: Running, count: int = 1) -> StageWork:
             remedy="lower image.pixels, or the number of channels",
         )
     chosen = run.visibilities * inside(imager.uv_range, run)
-    seconds = GRIDDING * 5 * chosen + PICKING * run.visibilities + 2e-7 * 5 * channels * imager.pixels**2
     together = min(HELD, chosen / channels)
+    calls = 5 * np.ceil(chosen / max(together, 1.0))
+    seconds = GRIDDING * 5 * chosen + PICKING * run.visibilities + TURNING * calls * imager.pixels**2
     return StageWork(
         f"{count_of(count * channels, 'image')} of {imager.pixels} x {imager.pixels} in I, Q, U, V and the PSF",
         seconds=count * seconds,

@@ -27,7 +27,9 @@ from instrument.planner import BLOCK_BYTES
 from instrument.report.page import Block, Card, Details, Figures, Section, Table, Text, number
 from instrument.visibilities import Visibilities
 
-DIRECTIONAL = 2.5e-6  # seconds of a visibility and a pair of directions, solved for all directions at once
+HARD = 18.0  # times the sweeps of a solve where much of the sky is not in the model
+SHELLS = 4.0  # times the seconds of a prediction where it is made in parts
+DIRECTIONAL = 1.4e-6  # seconds of a visibility and a pair of directions, solved for all directions at once
 
 
 def _common(beside: Beside) -> dict[str, Any]:
@@ -61,12 +63,13 @@ class IncompleteModelStage(Stage):
         lab, count = self.laboratory, len(self.laboratory.models)
         drawn = StageWork() if lab.image is None else imaging(lab.image, run, count + 1)
         solved = solving(lab.selfcal.tolerance, run)
-        stations = run.plan.problem.at.shape[2]
-        moved = 3e-9 * lab.watched * stations**2 * run.plan.problem.shape[0] / lab.every
-        block = 64.0 * run.visibilities * min(1.0, SOLVED_TOGETHER * run.plan.workers / run.plan.problem.shape[0])
+        times, channels, baselines = run.plan.problem.shape
+        columns = 3.0 * lab.watched  # flux and position of each source
+        moved = channels * times / lab.every * baselines * (8 * columns**2 / 1e11 + 2e-8 * columns)
+        block = 64.0 * run.visibilities * min(1.0, SOLVED_TOGETHER * run.plan.workers / times)
         return drawn._replace(
             does=f"calibration on {count} models; {drawn.does}".rstrip("; "),
-            seconds=drawn.seconds + count * solved.seconds + 1.3 * run.plan.seconds + count * moved,
+            seconds=drawn.seconds + HARD * count * solved.seconds + SHELLS * run.plan.seconds + moved,
             finish_seconds=1.0 + 2e-6 * (0 if lab.image is None else count * lab.image.pixels**2),
             block_bytes=drawn.block_bytes + solved.block_bytes + run.plan.memory + (count + 8) * block,
             figures=1 if lab.image is None else 2,
