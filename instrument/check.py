@@ -252,12 +252,16 @@ def _sum(problem: Problem) -> Complex:
     out = np.asarray((rows @ columns.conj().T).reshape(stations, 2, stations, 2)[a, :, b, :])
     if not len(shaped):
         return out
-    step = max(1, ROOM // max(len(shaped), 1))
+    # only the shapes, before anything is of all baselines: 4000 points on 1711 of them took 0.6 GB
+    wide, other = left[:, shaped], right[:, shaped]
+    some = sky if listed is None else listed.select(shaped)
+    at = at if listed is None else at.towards(*some.directions())
+    step = max(1, ROOM // len(shaped if listed is not None else range(sources)))
     for first in range(0, len(a), step):
         p, q = a[first : first + step], b[first : first + step]
-        found = sky.envelope(at, (waves[p] - waves[q])[None, None])
-        taken = np.ones((1, 1)) if found is None else found[0, 0][:, shaped]
-        each = mat2.mul(left[p][:, shaped], mat2.herm(right[q][:, shaped]))
+        found = some.envelope(at, (waves[p] - waves[q])[None, None])
+        taken = np.ones((1, 1)) if found is None else found[0, 0]
+        each = mat2.mul(wide[p], mat2.herm(other[q]))
         out[first : first + step] += (each * taken[..., None, None]).sum(axis=1)
     return out
 
