@@ -315,9 +315,10 @@ def _blocks(ready: Prepared, workers: int, limit: float) -> tuple[tuple[int, int
     atoms = int(min(BLOCK_BYTES, (limit - whole.shared_bytes) / workers) // slot)
     if atoms < 1:
         if (least := whole.shared_bytes + slot * workers) > limit:
+            fewer = f"fewer threads than {workers} (--workers), " if whole.shared_bytes + slot <= limit else ""
             raise RefusedError(
                 f"one block needs {si_prefix(least, 'B')} and the limit is {si_prefix(limit, 'B')}: give "
-                "more memory (--memory), or fewer sources (--set sky.brightest=N)"
+                f"{fewer}more memory (--memory), or fewer sources (--set sky.brightest=N)"
             )
         atoms = 1
     across = min(-(-channels // nf), atoms)

@@ -90,6 +90,10 @@ class Reading:
                 raise InputError(f"--common-beam: {error}") from None
         return cube, weights
 
+    def files(self, paths: Sequence[str]) -> list[str]:
+        """The files that are read."""
+        return [*paths, *(file for file in (self.noise, self.psf, self.weights) if file is not None)]
+
     def quiet(self, cube: StokesCube) -> StokesCube | None:
         """The cube of noise, where one is named, of the same band; what its file does not say is as for the cube."""
         if self.noise is None:
@@ -116,7 +120,7 @@ def analyze_files(
     Raises `InputError` before anything is computed when files or settings will not do, with the option that helps.
     """
     reading = reading or Reading()
-    folder = RunFolder(Path(paths[0]).name.split(".fits")[0], out, force)
+    folder = RunFolder(Path(paths[0]).name.split(".fits")[0], out, force, reading.files(paths))
     with unused_ledger() as ledger, _options():
         cube, weights = reading.cube(paths)
         quiet = reading.quiet(cube)

@@ -115,7 +115,9 @@ def compare_runs(
     first: str, second: str, out: str | None = None, show: Callable[[str], None] = print, force: bool = False
 ) -> Comparison:
     """Compare two run folders; with `out` a folder with compare.html, compare.json and figures is written."""
-    folder = None if out is None else RunFolder("compare", out, force)
+    folder = (
+        None if out is None else RunFolder("compare", out, force, [Path(run) / "run.json" for run in (first, second)])
+    )
     found = compare(first, second)
     if folder is not None:
         from instrument.report.compare_page import page_of_comparison

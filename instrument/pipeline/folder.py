@@ -8,6 +8,7 @@ import fcntl
 import os
 import shutil
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 from instrument.errors import InputError, warn
@@ -23,13 +24,16 @@ class RunFolder:
     Inside, `partial` is where to write. Without `finish` nothing is left, not even folders made for it; what runs that
     were killed have left beside it is removed and named. `out=None` takes runs/NAME, or the next free name. Raises
     `InputError` when the folder is not empty or cannot be made. With `force` a folder that a run wrote is replaced,
-    once everything is written; no other folder is.
+    once everything is written; no other folder is, nor one that holds a file of `reads`.
     """
 
-    def __init__(self, name: str, out: str | None, force: bool = False) -> None:
+    def __init__(
+        self, name: str, out: str | None, force: bool = False, reads: Sequence[str | os.PathLike[str]] = ()
+    ) -> None:
         self._name, self._out, self._force = name.strip(".") or "run", out, force
         with self._one_line():
             self.path = self._free()
+            self._keeps(reads)
         self._made: list[Path] = []
 
     def __enter__(self) -> RunFolder:
@@ -104,6 +108,15 @@ class RunFolder:
         if Path(self._out).is_absolute() or folder.is_symlink() or folder == Path.cwd():
             return folder  # nothing can be moved onto "."
         return Path(os.path.relpath(folder))
+
+    def _keeps(self, reads: Sequence[str | os.PathLike[str]]) -> None:
+        """Raises `InputError` where a folder would be replaced in which a file lies that is read."""
+        if self._replaces(self.path):
+            there = self.path.resolve()
+            for file in reads:
+                if there in Path(file).expanduser().resolve().parents:
+                    place = self._out if self._out is not None else self.path
+                    raise InputError(f"--out {place}: what is read lies in it ({file}); choose another")
 
     @contextlib.contextmanager
     def _one_line(self):  # type: ignore[no-untyped-def]

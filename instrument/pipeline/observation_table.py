@@ -51,7 +51,7 @@ class Frequency(Component):
                     "give one of them (bandwidth is that of all channels together)"
                 )
         lowest = self.centre - width * (self.channels - 1) / 2
-        if lowest <= 0:
+        if lowest <= 0 or lowest - width / 2 < -1e-9 * width:
             raise InputError(
                 f"frequency: {self.channels} channels of {si_prefix(width, 'Hz')} about {si_prefix(self.centre, 'Hz')} "
                 f"begin below 0: {first} or channels is too large"

@@ -82,6 +82,8 @@ def test_g1_either_width_or_both_where_they_agree(given):
             ("80 channels of 4 MHz about 150 MHz begin below 0: channel_width",),
         ),
         ({"bandwidth": "400 MHz", "channels": 80}, ("begin below 0: bandwidth",)),
+        # the centres are above 0, the lowest edge is at -50 MHz
+        ({"bandwidth": "400 MHz", "channels": 2}, ("begin below 0: bandwidth",)),
         ({"channel_width": "1e-9 Hz", "channels": 2}, ("channel_width = 1e-09 Hz is too narrow",)),
         ({"channels": 2, "channel_with": "4 MHz"}, ("did you mean 'channel_width'",)),
     ],

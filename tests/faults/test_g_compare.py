@@ -205,3 +205,10 @@ def test_records_that_anyone_may_have_written_do_no_harm(runs, capsys):
 
 def test_shares_are_said_as_a_person_says_them():
     assert [percent(x) for x in (0.123, np.nan, np.inf)] == ["12 %", "other words", "no number in one of them"]
+
+
+@pytest.mark.parametrize("out", ["a", "b"])
+def test_a_run_that_is_compared_is_not_replaced_by_what_is_said_of_it(runs, capsys, out):
+    assert main(["compare", "a", "b", "--out", out, "--force"]) == 2
+    assert f"--out {out}: what is read lies in it ({out}/run.json); choose another" in capsys.readouterr().err
+    assert (runs / out / "run.json").is_file() and not (runs / out / "compare.json").exists()

@@ -148,3 +148,13 @@ def test_i7_a_name_of_255_bytes_still_has_a_partial_folder(here):
 def test_i7_the_name_of_a_hidden_file_does_not_name_the_folder_of_all_runs(here):
     assert written(name="").parts == ("runs", "run")
     assert written(name="..").parts == ("runs", "run-2")
+
+
+@pytest.mark.parametrize("out", ["run", "link"])
+def test_a_folder_is_not_replaced_by_what_is_made_of_its_files(here, out):
+    written("run", "run")
+    (here / "run" / "cube.fits").touch()
+    (here / "link").symlink_to("run")
+    with pytest.raises(InputError, match=rf"--out {out}: what is read lies in it \(run/cube.fits\); choose another"):
+        RunFolder("cube", out, force=True, reads=["run/cube.fits"])
+    assert RunFolder("cube", out, force=True, reads=["cube.fits"]).path

@@ -107,8 +107,10 @@ def test_what_is_shared_is_counted_once_and_leaves_room_for_large_blocks(engines
     result = 64.0 * 3 * np.prod(made.block_shape)
     assert made.block_shape == (8, 3)
     assert made.memory == 1e9 + 3 * (made.work.slot_bytes + result)
-    with pytest.raises(RefusedError, match=r"one block needs 1 GB and the limit is 900 MB"):
+    with pytest.raises(RefusedError, match=r"one block needs 1 GB and the limit is 900 MB: give more memory"):
         plan(memory="0.9 GB")
+    with pytest.raises(RefusedError, match=r"give fewer threads than 100000 \(--workers\), more memory \(--memory\)"):
+        plan(workers=100_000, memory="1.001 GB")
 
 
 def test_an_engine_may_refuse_a_tolerance_and_the_next_one_is_taken(engines):

@@ -250,3 +250,15 @@ def test_without_a_place_to_keep_it_the_speed_is_measured_all_the_same(monkeypat
 
 def test_a_speed_is_near_that_of_the_last_measurement():
     assert 0.2 < machine.measured() / machine.measured() < 5
+
+
+@pytest.mark.parametrize("spoil", [os.mkfifo, lambda path: (path.touch(), os.truncate(path, 1 << 40))])
+def test_a_pipe_or_a_file_without_end_in_the_place_of_the_speed_holds_nothing_up(monkeypatch, spoil):
+    monkeypatch.setattr(machine, "measured", lambda: 0.6)
+    path = machine.kept_in()
+    path.parent.mkdir(parents=True)
+    spoil(path)
+    # whoever opens the pipe to read waits for a writer: never, so this stops the test instead
+    monkeypatch.setattr(Path, "read_text", lambda *a, **k: pytest.fail("read whole, without a look at what it is"))
+    assert machine.speed() == 0.6
+    assert json.loads(path.read_bytes())["speed"] == 0.6
