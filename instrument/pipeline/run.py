@@ -151,7 +151,9 @@ def _write(result: Result, tables: dict[str, Any], folder: Path) -> None:
     begin = time.perf_counter()
     (folder / "scene.toml").write_text(to_toml(tables), encoding="utf-8")
     for stage in result.stages.values():
+        give_back()
         stage.write(folder)
+    give_back()
     what = record(result, tables)
     draw = drawer(folder)
     # what the scene is about comes first, then the last that was made of it

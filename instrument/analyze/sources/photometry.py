@@ -14,7 +14,7 @@ import numpy as np
 
 from instrument.analyze.sources.blanks import CHUNKS, FREE, PLACES, excess, places
 from instrument.analyze.sources.patches import gathered, groups, mixture
-from instrument.analyze.sources.told_apart import coincide, conjugate_gradients, positive_solve
+from instrument.analyze.sources.told_apart import coincide, conjugate_gradients, mirrored, positive_solve
 from instrument.component import Component
 from instrument.errors import InputError, Outcome
 from instrument.jones import mueller
@@ -161,7 +161,7 @@ class PhotometrySums:
                     continue
                 plain = whole and bool(np.all(weight == weight[0]))
                 slot = _Slot(uvw, weight[:1] if plain else weight, plain, channel.mix, block.antenna1, block.antenna2)
-                # where a weight is zero the data may be NaN
+                # of no weight, the data may be NaN
                 data = mueller.stokes(np.where(weight[:, None, None] > 0, block.data[t, f], 0.0))
                 channel.slots.append(slot)
                 seen = self._adjoint_sources(slot, self._fringes(slot), data * weight[:, None])
@@ -335,12 +335,12 @@ class PhotometrySums:
                 towards = self._adjoint_sources(slot, z, self._pattern(slot, z) * slot.weight[0])
                 columns += towards[:sources]
                 wide[chunk] += towards[sources:]
-        upper = np.triu(out)
-        out = upper + np.triu(upper, 1).T
+        mirrored(out, ROWS)
         out[:, shaped], out[shaped] = columns, columns.T
         beside[:, shaped] = wide.transpose(0, 2, 1)
-        mixed = gathered(out * channel.mix[:, None], self.group, count)
-        return gathered((mixed * channel.mix).T.copy(), self.group, count), beside
+        out *= channel.mix[:, None]
+        mixed = gathered(out, self.group, count)
+        return gathered(np.ascontiguousarray(np.multiply(mixed, channel.mix, out=mixed).T), self.group, count), beside
 
     def _normal(self, channel: _Channel, flux: Float) -> Float:
         out = np.zeros_like(flux)

@@ -68,7 +68,7 @@ def _faraday(result: CubeProducts, figure: Draw) -> Section | None:
                 "edges, and most of it is missing."
             )
         )
-    if not np.nan_to_num(found.data).any():
+    if not any(np.nan_to_num(plane).any() for plane in found.data):
         return Section("Faraday depth", [*blocks, Text("There is no polarized emission in the cube to draw.")])
     y, x = result.brightest
     line = lines_of_sight(result.sights)
