@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import json
 import os
 import shutil
 import tempfile
@@ -13,6 +14,7 @@ from pathlib import Path
 
 from instrument.errors import InputError, warn
 
+MOST_BYTES = 200e6  # of a record
 PARTIAL = ".instrument-partial"  # ends the names of folders that are being written
 OURS = ("run.json", "compare.json")  # files that only a folder written here holds
 TAKEN = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)  # what moving a folder onto something else answers
@@ -86,7 +88,7 @@ class RunFolder:
 
     def _replaces(self, folder: Path) -> bool:
         """Whether an earlier run folder is there that may go."""
-        return self._force and folder.is_dir() and any((folder / name).is_file() for name in OURS)
+        return self._force and _written_here(folder)
 
     def _free(self) -> Path:
         """The folder asked for, which must be empty, or the next free one under runs/."""
@@ -98,7 +100,7 @@ class RunFolder:
         if folder.is_symlink():
             raise InputError(f"--out {self._out}: its links lead to one another; choose another")
         if folder.exists() and not self._replaces(folder) and (not folder.is_dir() or any(folder.iterdir())):
-            if not self._force and any((folder / name).is_file() for name in OURS):
+            if not self._force and _written_here(folder):
                 raise InputError(f"--out {self._out}: there is a run in it; choose another, or replace it with --force")
             raise InputError(f"--out {self._out}: it exists and is not an empty folder; choose another")
         if folder.is_dir() and os.path.ismount(folder):
@@ -128,6 +130,18 @@ class RunFolder:
             raise
         except (OSError, ValueError, RuntimeError) as error:  # a name with a NUL; a home that is not known
             raise InputError(f"{where}: {getattr(error, 'strerror', None) or error}; choose another folder") from None
+
+
+def _written_here(folder: Path) -> bool:
+    """Whether a folder was written by a run or a comparison: a record in it says what versions made it."""
+    for name in OURS:
+        try:
+            file = folder / name
+            if file.is_file() and file.stat().st_size < MOST_BYTES and "versions" in json.loads(file.read_bytes()):
+                return True
+        except (OSError, ValueError, TypeError, RecursionError):
+            continue
+    return False
 
 
 def clean(folder: Path) -> list[str]:

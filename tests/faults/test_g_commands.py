@@ -175,21 +175,30 @@ def test_g10_every_public_write_has_the_argument():
 
 def run_in(folder, text, force=False, name="s"):
     with RunFolder(name, folder, force) as one:
-        (one.partial / "run.json").write_text(text)
+        (one.partial / "run.json").write_text(json.dumps({"versions": {}, "text": text}))
         return one.finish()
+
+
+def text_in(folder):
+    return json.loads((folder / "run.json").read_text())["text"]
 
 
 def test_g10_a_run_is_replaced_only_when_asked_and_only_a_run(here):
     run_in("a", "1")
     with pytest.raises(InputError, match="there is a run in it; choose another, or replace it with --force"):
         run_in("a", "2")
-    assert (here / "a" / "run.json").read_text() == "1"
+    assert text_in(here / "a") == "1"
     assert run_in("a", "3", force=True) == Path("a")
-    assert (here / "a" / "run.json").read_text() == "3"
+    assert text_in(here / "a") == "3"
     (here / "mine").mkdir()
     (here / "mine" / "thesis.tex").write_text("precious")
     with pytest.raises(InputError, match="is not an empty folder"):
         run_in("mine", "4", force=True)
+    for record in ("{}", "[]", "3", "no record"):  # a file of that name is not yet a run
+        (here / "mine" / "run.json").write_text(record)
+        with pytest.raises(InputError, match="is not an empty folder"):
+            run_in("mine", "4", force=True)
+    assert (here / "mine" / "thesis.tex").read_text() == "precious"
     assert sorted(p.name for p in here.iterdir()) == ["a", "mine", "s.toml"]
     # without --out: the next free name, or the same with --force
     assert [run_in(None, "x"), run_in(None, "y"), run_in(None, "z", force=True)] == [
@@ -197,7 +206,7 @@ def test_g10_a_run_is_replaced_only_when_asked_and_only_a_run(here):
         Path("runs/s-2"),
         Path("runs/s"),
     ]
-    assert (here / "runs" / "s" / "run.json").read_text() == "z"
+    assert text_in(here / "runs" / "s") == "z"
     assert sorted(p.name for p in (here / "runs").iterdir()) == ["s", "s-2"]
 
 
@@ -205,7 +214,7 @@ def test_g10_a_run_that_fails_leaves_the_earlier_one(here):
     run_in("a", "1")
     with pytest.raises(ZeroDivisionError), RunFolder("s", "a", True) as one:
         (one.partial / "run.json").write_text(str(1 / 0))
-    assert (here / "a" / "run.json").read_text() == "1" and sorted(p.name for p in here.iterdir()) == ["a", "s.toml"]
+    assert text_in(here / "a") == "1" and sorted(p.name for p in here.iterdir()) == ["a", "s.toml"]
 
 
 def test_g10_the_help_says_what_happens(capsys):

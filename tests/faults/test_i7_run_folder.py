@@ -152,7 +152,7 @@ def test_i7_the_name_of_a_hidden_file_does_not_name_the_folder_of_all_runs(here)
 
 @pytest.mark.parametrize("out", ["run", "link"])
 def test_a_folder_is_not_replaced_by_what_is_made_of_its_files(here, out):
-    written("run", "run")
+    written("run", "run", '{"versions": {}}')
     (here / "run" / "cube.fits").touch()
     (here / "link").symlink_to("run")
     with pytest.raises(InputError, match=rf"--out {out}: what is read lies in it \(run/cube.fits\); choose another"):
