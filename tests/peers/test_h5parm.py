@@ -142,7 +142,7 @@ def test_dp3_applies_coarse_solutions_to_the_same_slots_and_channels(case):
 
 def test_our_selfcal_solution_corrects_the_data_in_dp3(case):
     solution = SelfCal(tolerance=1e-10).solve(case.data, case.model)
-    write_h5parm(case.folder / "ours.h5", solution, at=case.data.at)
+    write_h5parm(case.folder / "ours.h5", solution, at=case.data.at, overwrite=True)
     data, flag = case.applied("ours.h5", FULL)
     assert not flag.any()
     assert error(data, case.model.data, "our solution, applied by DP3, minus the model") < 3e-7
