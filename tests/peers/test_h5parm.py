@@ -104,7 +104,7 @@ def test_dp3_applies_our_file_as_we_do(case, pattern, how):
     if pattern == "phase":
         values = np.exp(1j * np.angle(values)) * np.eye(2)
     term = case.truth.with_fields(values=values)
-    write_h5parm(case.folder / "ours.h5", term, pattern, at=case.data.at)
+    write_h5parm(case.folder / "ours.h5", term, pattern, at=case.data.at, overwrite=True)
     data, flag = case.applied("ours.h5", how)
     assert not flag.any()
     assert error(data, case.data.corrected(term).data, f"{pattern}, applied by DP3") < 2e-7  # measured below 1e-7
@@ -118,7 +118,7 @@ def test_dp3_flags_what_we_flag(case):
     values[1, :, 2] = 0
     values[3, :, 4] = 1
     term = case.truth.with_fields(values=values)
-    write_h5parm(case.folder / "ours.h5", term, at=case.data.at)
+    write_h5parm(case.folder / "ours.h5", term, at=case.data.at, overwrite=True)
     data, flag = case.applied("ours.h5", FULL)
     wanted = case.data.corrected(term)
     assert np.array_equal(flag, wanted.flag)
@@ -135,7 +135,7 @@ def test_dp3_applies_coarse_solutions_to_the_same_slots_and_channels(case):
         freq_hz=at.freq_hz.reshape(2, 2).mean(axis=1),
         stations=STATIONS,
     )
-    write_h5parm(case.folder / "ours.h5", coarse, at=at)
+    write_h5parm(case.folder / "ours.h5", coarse, at=at, overwrite=True)
     data, _ = case.applied("ours.h5", FULL)
     assert error(data, case.data.corrected(coarse).data, "coarse, applied by DP3") < 2e-7
 
