@@ -75,7 +75,7 @@ def main():
             print(lines[-1], flush=True)
     if given.show:
         return
-    text = f"""# The plan of every shipped scene against its run
+    text = f"""# The plans of shipped scenes against their runs
 
 {date.today()}, {os.cpu_count()} cores ({platform.machine()}), speed {speed():.2f} of the machine of the costs, Python
 {platform.python_version()}, numpy {version("numpy")}, instrument {version("instrument")}.

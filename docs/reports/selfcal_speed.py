@@ -32,7 +32,7 @@ load = lambda name: Visibilities(np.load(f"{sys.argv[1]}/{name}.npy").astype(com
 data, model = load("data"), load("model")
 solution = SelfCal(tolerance=float(sys.argv[2])).solve(data, model)
 solution.check()
-write_h5parm(sys.argv[1] + "/ours.h5", solution, at=at)
+write_h5parm(sys.argv[1] + "/ours.h5", solution, at=at, overwrite=True)
 """
 
 
