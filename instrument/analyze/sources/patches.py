@@ -31,6 +31,18 @@ def gathered(values: Any, group: Int, count: int) -> Any:
     return out
 
 
+def gathered_square(matrix: Float, group: Int, first: Int, mix: Float) -> Float:
+    """Sum of mix_j M_ji mix_i over the sources i, j of groups, (G, G), of M (S, S), which is overwritten."""
+    rest = np.setdiff1d(np.arange(len(group)), first)
+    matrix *= mix[:, None]
+    for i in rest:  # into the first of its group: no copies, 4571 sources are 167 MB
+        matrix[first[group[i]]] += matrix[i]
+    matrix *= mix
+    for i in rest:
+        matrix[:, first[group[i]]] += matrix[:, i]
+    return np.asarray(matrix.T[np.ix_(first, first)])
+
+
 def mixture(flux: Float, group: Int, count: int) -> Float:
     """Share of each source in its group, (S,): of the sum of I, of that of |I| where it cancels, or equal parts."""
     size = np.bincount(group, np.abs(flux), count)

@@ -13,7 +13,7 @@ from typing import Annotated
 import numpy as np
 
 from instrument.analyze.sources.blanks import CHUNKS, FREE, PLACES, excess, places
-from instrument.analyze.sources.patches import gathered, groups, mixture
+from instrument.analyze.sources.patches import gathered, gathered_square, groups, mixture
 from instrument.analyze.sources.told_apart import coincide, conjugate_gradients, mirrored, positive_solve
 from instrument.component import Component
 from instrument.errors import InputError, Outcome
@@ -317,7 +317,7 @@ class PhotometrySums:
 
         And between sources and blank places in each chunk of time, (C, S, M).
         """
-        sources, count, shaped = len(self.group), len(self.first), self.shaped
+        sources, _count, shaped = len(self.group), len(self.first), self.shaped
         out = np.zeros((sources, sources))
         columns = np.zeros((sources, len(shaped)))
         beside = np.zeros((int(channel.chunk[-1]) + 1, sources, PLACES))
@@ -338,9 +338,7 @@ class PhotometrySums:
         mirrored(out, ROWS)
         out[:, shaped], out[shaped] = columns, columns.T
         beside[:, shaped] = wide.transpose(0, 2, 1)
-        out *= channel.mix[:, None]
-        mixed = gathered(out, self.group, count)
-        return gathered(np.ascontiguousarray(np.multiply(mixed, channel.mix, out=mixed).T), self.group, count), beside
+        return gathered_square(out, self.group, self.first, channel.mix), beside
 
     def _normal(self, channel: _Channel, flux: Float) -> Float:
         out = np.zeros_like(flux)

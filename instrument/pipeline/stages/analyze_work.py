@@ -38,7 +38,7 @@ def photometry(settings: ForcedPhotometry, run: Running, jones: float) -> StageW
         held_bytes=slots * (24.0 * stations + 8 * 4 * PLACES + 600 + (0 if plain else 8.0 * baselines)),
         block_bytes=16.0 * 2 * stations * wide + 64.0 * 4 * baselines,
         finish_bytes=max(
-            8.0 * (4 * sources**2 + 2 * CHUNKS * sources * PLACES) + 32.0 * ROWS * sources if full else 0.0,
+            8.0 * (3 * sources**2 + 2 * CHUNKS * sources * PLACES) + 32.0 * ROWS * sources if full else 0.0,
             EXPECTED * stations * sources,
         ),
         result_bytes=slots * 24.0 * stations,
