@@ -317,7 +317,7 @@ class PhotometrySums:
 
         And between sources and blank places in each chunk of time, (C, S, M).
         """
-        sources, _count, shaped = len(self.group), len(self.first), self.shaped
+        sources, shaped = len(self.group), self.shaped
         out = np.zeros((sources, sources))
         columns = np.zeros((sources, len(shaped)))
         beside = np.zeros((int(channel.chunk[-1]) + 1, sources, PLACES))
