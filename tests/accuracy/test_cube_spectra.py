@@ -412,8 +412,8 @@ def test_tables_have_units_and_come_back(tmp_path):
 
     analyzer = Analyzer(cube(np.random.default_rng(0).normal(size=(8, 12, 12))))
     for made, rows in ((analyzer.cylindrical(bins=3), 12), (analyzer.spherical(bins=5), 5)):
-        made.write(tmp_path / "spectrum.ecsv")
-        back = QTable.read(tmp_path / "spectrum.ecsv", format="ascii.ecsv")
+        made.write(tmp_path / f"spectrum_{rows}.ecsv")
+        back = QTable.read(tmp_path / f"spectrum_{rows}.ecsv", format="ascii.ecsv")
         assert len(back) == rows and back["power"].unit == u.K**2 * u.Mpc**3
         np.testing.assert_allclose(back["power"].value, made.power.ravel(), rtol=1e-12)
         assert back.meta["taper"] == "blackman-harris" and back.meta["horizon_slope"] == pytest.approx(3.59, abs=0.01)

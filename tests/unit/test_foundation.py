@@ -14,7 +14,7 @@ from instrument_plugins.elements.dipole import CrossedDipole
 from instrument_plugins.elements.dish import Airy, Gaussian
 from instrument_plugins.elements.hamaker import Hamaker
 from instrument_plugins.telescopes.lofar import LofarHBA
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 import instrument
 from instrument import Chain, Composed, FeedTerm, GainTerm, Layout, Observation, Parallactic, Scene
@@ -191,8 +191,9 @@ def test_a_missing_field_is_named():
 
 def test_a_field_cannot_be_changed():
     dish = Airy(diameter=25 * u.m)
-    with pytest.raises(ValidationError, match="frozen"):
+    with pytest.raises(InputError, match="frozen"):
         dish.diameter = 30.0
+    assert dish.diameter == 25.0
 
 
 def test_arrays_are_copied_in_and_read_only():
