@@ -212,10 +212,8 @@ def test_every_shipped_scene_takes_what_its_plan_says_and_at_most_a_gigabyte(who
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("scene", "quarter"), [("di-errors", "60 s"), ("faraday-leakage", "80 min"), ("3c196", "60 s")]
-)
-def test_a_run_that_is_four_or_six_times_longer_takes_no_more_memory(tmp_path, whole, scene, quarter):
+@pytest.mark.parametrize(("scene", "quarter"), [("faraday-leakage", "80 min")])
+def test_a_run_that_is_four_times_longer_takes_no_more_memory(tmp_path, whole, scene, quarter):
     _, short = process(tmp_path, scene, f"observation.interval={quarter}")
     # solutions, and what fluxes keep of every integration, are 2 to 20 MB
     assert whole(scene)[1] <= 1.1 * short
