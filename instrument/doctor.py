@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from instrument.machine import kept_in, speed
+from instrument.machine import kept_in, measured_and_kept
 from instrument.pipeline.folder import leftovers
 from instrument.pipeline.record import package_version
 
@@ -45,7 +45,7 @@ def doctor(show: Callable[[str], None]) -> bool:
         show(f"{name:<20} {package_version(name)} (optional: {use})")
     show(f"cores         {os.cpu_count()}")
     show(f"memory        {_memory_gb():.1f} GB")
-    show(f"speed         {speed():.2f} of the machine on which costs were measured (kept in {kept_in()})")
+    show(f"speed         {measured_and_kept():.2f} of the machine on which costs were measured (kept in {kept_in()})")
     show(f"Earth table   measured and predicted to {_table_end()}")
     fine = True
     from instrument.registry import KINDS, available

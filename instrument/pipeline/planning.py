@@ -32,18 +32,20 @@ LIBRARIES = 60e6  # bytes of compiled loops and of the libraries that stages loa
 PAGE_BYTES, PAGE_SECONDS, FIGURE_SECONDS = 120e6, 0.8, 0.7  # matplotlib and jinja2 loaded; a figure, day and night
 
 
-def plan_run(file: SceneFile, scene: Scene, memory: Any = None, workers: int | None = None) -> RunPlan:
+def plan_run(
+    file: SceneFile, scene: Scene, memory: Any = None, workers: int | None = None, verify: bool = True
+) -> RunPlan:
     """The plan of a run of `scene`; `memory` (as "8 GB", by default three quarters of the machine) binds the whole.
 
     Raises `RefusedError` that names the largest step where even the smallest blocks do not fit.
     """
     limit = memory_limit(memory)
-    found = whole(file, scene, file.plan(scene, None, workers))
+    found = whole(file, scene, file.plan(scene, None, workers), verify)
     for _ in range(HALVINGS):
         if found.memory <= limit:
             return found
         try:
-            found = whole(file, scene, file.plan(scene, f"{found.plan.memory / 2:.0f} byte", workers))
+            found = whole(file, scene, file.plan(scene, f"{found.plan.memory / 2:.0f} byte", workers), verify)
         except RefusedError:
             break
     raise RefusedError(_too_much(found, limit, memory))
@@ -61,7 +63,7 @@ def _too_much(found: RunPlan, limit: float, memory: Any) -> str:
     )
 
 
-def whole(file: SceneFile, scene: Scene, plan: Plan) -> RunPlan:
+def whole(file: SceneFile, scene: Scene, plan: Plan, verify: bool = True) -> RunPlan:
     """What every step of a run costs on a plan of its prediction."""
     run = Running(file.name, file.seed, scene.instrument, plan, file.running)
     works = {} if file.alone else {PREDICT: predicting(plan)}
@@ -70,7 +72,8 @@ def whole(file: SceneFile, scene: Scene, plan: Plan) -> RunPlan:
     items = {}
     for name, stage in file.running.items():
         works[name], items[name] = stage.work(run), stage.items(run)
-    works[VERIFY] = _verifying(plan)
+    if verify:
+        works[VERIFY] = _verifying(plan)
     figures = sum(work.figures for work in works.values())
     works[WRITE] = StageWork(
         f"tables, page, {count_of(figures, 'figure')}",

@@ -60,7 +60,7 @@ def _planned(scene_file: SceneFile, path: Path, memory: str | None, workers: int
     """What will be filled: the scene and its plan."""
     begin = time.perf_counter()
     scene = scene_file.scene()
-    whole = plan_run(scene_file, scene, memory, workers)
+    whole = plan_run(scene_file, scene, memory, workers, verify)
     plan = whole.plan
     if verify:  # the blocks as the stages get them, before any corruption
         plan = plan.watched(samples=64, seed=scene_file.seed)

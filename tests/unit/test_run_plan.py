@@ -119,6 +119,24 @@ def test_the_plan_of_every_shipped_scene_has_a_line_for_every_stage_and_the_sum(
     assert plan.memory >= plan.base_bytes + plan.plan.memory * ("predict" in plan.works)
 
 
+def test_a_check_that_is_not_made_is_not_planned():
+    file = parse(override(read_tables("mock-grid"), SMALL))
+    assert "verify" not in plan_run(file, file.scene(), verify=False).works
+
+
+def test_weights_that_need_a_density_cost_another_pass_and_its_plane():
+    natural, briggs = (
+        planned("mock-grid", *SMALL, f"image.weighting='{w}'").works["image"] for w in ("natural", "briggs")
+    )
+    assert briggs.held_bytes - natural.held_bytes == 8 * 64**2 and briggs.seconds > natural.seconds
+
+
+def test_leakage_of_a_sky_that_is_no_list_is_refused_by_the_plan(monkeypatch):
+    monkeypatch.setattr("instrument.pipeline.stages.leakage.points_of", lambda sky: None)
+    with pytest.raises(InputError, match=r"\[analyze\] products = \['leakage'\] needs a sky that is a list of sources"):
+        planned("mock-grid", *SMALL)
+
+
 def test_items_say_which_visibilities_no_image_takes():
     assert re.search(r"left out +image: visibilities +\d+% outside uv_range", str(planned("mock-grid", *SMALL)))
 

@@ -1,10 +1,7 @@
 """Stages: one table of a scene file each, in declared order, ours and a stranger's by the same door."""
 
 import json
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -30,30 +27,10 @@ def small(*settings):
     return override(read_tables("mock-grid"), [*SMALL, *settings])
 
 
-@pytest.fixture
-def strangers(tmp_path):
-    """A package of somebody else, made of the page on extending, as it lies after its installation."""
-    block = next(b for b in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.S) if "class Flagged" in b)
-    head = "from typing import Annotated\nimport numpy as np\nfrom pydantic import Field\n"
-    (tmp_path / "site").mkdir()
-    (tmp_path / "site" / "my_package.py").write_text(head + block.partition("instrument.conformance")[0])
-    info = tmp_path / "site" / "my_package-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-package\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[instrument.stages]\nflagged = my_package:Flagged\n")
-    return tmp_path / "site"
-
-
-def command(strangers, where, *words):
-    return subprocess.run(
-        [sys.executable, "-m", "instrument.cli", *words], cwd=where, capture_output=True, text=True, timeout=300,
-        env={**os.environ, "PYTHONPATH": str(strangers)},
-    )  # fmt: skip
-
-
-def test_a_stage_of_a_stranger_works_from_a_scene_file_in_the_plan_and_in_the_report(strangers, tmp_path):
+def test_a_stage_of_a_stranger_works_from_a_scene_file_in_the_plan_and_in_the_report(package, command, tmp_path):
+    site = package({"stages": {"flagged": "Flagged"}})
     words = [w for s in (*SMALL, "flagged.most=0.2") for w in ("--set", s)]
-    done = command(strangers, tmp_path, "run", "mock-grid", *words, "--out", "out")
+    done = command(site, "run", "mock-grid", *words, "--out", "out")
     assert done.returncode == 0, done.stderr
     assert re.search(r"kept +stages +correct, flagged, image, analyze, in this order", done.stdout)
     assert "flagged       at most 0 % of a station" in done.stdout
@@ -62,10 +39,10 @@ def test_a_stage_of_a_stranger_works_from_a_scene_file_in_the_plan_and_in_the_re
     assert record["scene"]["flagged"] == {"most": 0.2} and record["stages"]["flagged"]["seconds"]["measured"] >= 0
     page = (tmp_path / "out" / "report.html").read_text()
     assert "<td>flagged</td>" in re.sub(r"<td[^>]*><span>(.*?)</span></td>", r"<td>\1</td>", page)
-    wrong = command(strangers, tmp_path, "run", "mock-grid", *words, "--set", "flagged.mots=1")
+    wrong = command(site, "run", "mock-grid", *words, "--set", "flagged.mots=1")
     assert wrong.returncode == 2 and wrong.stderr.count("\n") == 1
     assert "[flagged] Flagged has no 'mots': did you mean 'most'" in wrong.stderr
-    assert "flagged" in command(strangers, tmp_path, "plugins").stdout
+    assert "flagged" in command(site, "plugins").stdout
 
 
 def test_what_a_run_finds_is_what_the_same_steps_find_by_hand_to_the_last_bit(tmp_path):

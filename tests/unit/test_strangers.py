@@ -1,18 +1,10 @@
 """A package of somebody else with all kinds of plugins, one file and its entry points, works from a scene file."""
 
-import ast
 import json
-import os
 import re
-import subprocess
-import sys
-from pathlib import Path
-
-import pytest
 
 from instrument.registry import KINDS
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "extending.md"
 POINTS = {
     "telescopes": {"ring": "Ring"},
     "elements": {"cosine": "Cosine"},
@@ -68,41 +60,13 @@ remover = { weighted = false }
 """
 
 
-@pytest.fixture(scope="module")
-def site(tmp_path_factory):
-    """The package as it lies after its installation: the classes of the page on extending."""
-    text = []
-    for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.S):
-        for node in ast.parse(block).body:
-            if isinstance(node, ast.Import | ast.ImportFrom | ast.ClassDef) or "SITE =" in ast.unparse(node):
-                text.append(ast.unparse(node))
-    folder = tmp_path_factory.mktemp("site")
-    info = folder / "my_package-1.0.dist-info"
-    info.mkdir()
-    (folder / "my_package.py").write_text("\n\n".join(text))
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-package\nVersion: 1.0\n")
-    points = [
-        f"[instrument.{kind}]\n" + "\n".join(f"{name} = my_package:{cls}" for name, cls in named.items())
-        for kind, named in POINTS.items()
-    ]
-    (info / "entry_points.txt").write_text("\n".join(points) + "\n")
-    return folder
-
-
-def command(site, where, *words):
-    return subprocess.run(
-        [sys.executable, "-m", "instrument.cli", *words], cwd=where, capture_output=True, text=True, timeout=300,
-        env={**os.environ, "PYTHONPATH": str(site)},
-    )  # fmt: skip
-
-
 def test_there_is_a_stranger_of_every_kind():
     assert set(POINTS) == set(KINDS)
 
 
-def test_one_file_and_entry_points_are_all_it_takes_for_all_kinds_together(site, tmp_path):
+def test_one_file_and_entry_points_are_all_it_takes_for_all_kinds_together(package, command, tmp_path):
     (tmp_path / "strange.toml").write_text(SCENE)
-    done = command(site, tmp_path, "run", "strange.toml", "--out", "out")
+    done = command(package(POINTS), "run", "strange.toml", "--out", "out")
     assert done.returncode == 0, done.stdout + done.stderr
     assert re.search(r"^engine +products ", done.stdout, re.M)
     assert re.search(r"^stage +image .* by Summed, ", done.stdout, re.M)
@@ -117,8 +81,8 @@ def test_one_file_and_entry_points_are_all_it_takes_for_all_kinds_together(site,
     assert (tmp_path / "out" / "cube.fits").exists() and (tmp_path / "out" / "report.html").exists()
 
 
-def test_all_of_them_are_listed_with_where_they_come_from(site, tmp_path):
-    said = command(site, tmp_path, "plugins").stdout
+def test_all_of_them_are_listed_with_where_they_come_from(package, command):
+    said = command(package(POINTS), "plugins").stdout
     for named in POINTS.values():
         for name, cls in named.items():
             assert re.search(rf"^  {name} +my-package +my_package:{cls}$", said, re.M), name

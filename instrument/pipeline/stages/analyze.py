@@ -18,7 +18,7 @@ from instrument.pipeline.stage import Beside, Draw, Running, Several, Stage, Sta
 from instrument.pipeline.stages.analyze_work import cube_products, photometry, together
 from instrument.pipeline.stages.cube import CubeAnalysis
 from instrument.pipeline.stages.image import Image, ImageResult
-from instrument.pipeline.stages.leakage import EXPECTED_JONES, LeakageRun
+from instrument.pipeline.stages.leakage import EXPECTED_JONES, LeakageRun, listed
 from instrument.pipeline.work import Items, StageWork
 from instrument.plan import Item
 from instrument.report.page import Figures, Section, Text
@@ -57,6 +57,8 @@ class Analyze(Stage):
         if "leakage" not in self.products:
             given = [key for key in ("uv_range", "every") if key in self.model_fields_set]
             unused("[analyze]", given, "they are of the product 'leakage'")
+        else:
+            listed(scene.sky.about(scene.observation.phase_centre))
         freq = scene.observation.freq_hz
         if self.cube is not None:  # said before the run, not at its end
             check_redshift(self.cube.redshift, float(freq.min()), float(freq.max()))

@@ -72,7 +72,7 @@ def cube_products(settings: CubeAnalysis, channels: int, pixels: int) -> StageWo
     if settings.wants("window"):
         seconds += 3 * 2e-7 * voxels
         figures += 1
-    text = ", ".join(settings.products or ("all products",))
+    text = "all products" if settings.products is None else ", ".join(settings.products) or "nothing"
     return StageWork(f"of the cube: {text}", finish_seconds=seconds, finish_bytes=held + most, result_bytes=held,
                      figures=figures, remedy="ask for fewer pixels, channels or depths")  # fmt: skip
 

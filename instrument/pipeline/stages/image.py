@@ -96,13 +96,16 @@ def imaging(imager: AnyImager, run: Running, count: int = 1) -> StageWork:
             remedy="lower image.pixels, or the number of channels",
         )
     chosen = run.visibilities * inside(imager.uv_range, run)
+    # a density of the uv plane, and a first pass over coordinates for it
+    weighed = 0.0 if imager.weighting == "natural" else 1.0
     together = min(HELD, chosen / channels)
     calls = 5 * np.ceil(chosen / max(together, 1.0))
-    seconds = GRIDDING * 5 * chosen + PICKING * run.visibilities + TURNING * calls * imager.pixels**2
+    seconds = GRIDDING * 5 * chosen + (1 + weighed) * PICKING * run.visibilities + TURNING * calls * imager.pixels**2
     return StageWork(
         f"{count_of(count * channels, 'image')} of {imager.pixels} x {imager.pixels} in I, Q, U, V and the PSF",
         seconds=count * seconds,
-        held_bytes=count * (5 * channels * plane + WAITING * min(chosen, HELD * channels, ALL_HELD)),
+        held_bytes=weighed * channels * plane
+        + count * (5 * channels * plane + WAITING * min(chosen, HELD * channels, ALL_HELD)),
         block_bytes=GRIDDED * together + 8 * 4 * plane + 128.0 * float(np.prod(run.block)),
         finish_bytes=GRIDDED * together + 8 * 4 * plane,
         result_bytes=count * 5 * channels * plane,

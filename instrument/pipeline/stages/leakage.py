@@ -17,7 +17,8 @@ from instrument.observe.sampling import Sampling
 from instrument.pipeline.stage import Draw, Running, StageResult, StageRun
 from instrument.plan import Plan
 from instrument.report.page import Block, Card, Details, Figures, Section, Table, Text, number
-from instrument.sky.points import points_of
+from instrument.sky.base import Sky
+from instrument.sky.points import PointSky, points_of
 from instrument.units import Direction, Float
 from instrument.visibilities import Visibilities
 
@@ -28,15 +29,20 @@ PLANES: tuple[tuple[Literal["linear", "circular"], str], ...] = (
 )
 
 
+def listed(sky: Sky) -> PointSky:
+    """The sources of a placed sky, whose fluxes are measured; raises `InputError` where it is no list of them."""
+    found = points_of(sky)
+    if found is None:
+        raise InputError("[analyze] products = ['leakage'] needs a sky that is a list of sources")
+    return found
+
+
 class LeakageRun(StageRun):
     """Measures the fluxes of all sources of a sky that is a list of them."""
 
     def __init__(self, run: Running, photometry: ForcedPhotometry) -> None:
-        sky = points_of(run.plan.problem.sky)
-        if sky is None:
-            raise InputError("[analyze] products = ['leakage'] needs a sky that is a list of sources")
         self.run = run
-        self.sums = photometry.start(sky)
+        self.sums = photometry.start(listed(run.plan.problem.sky))
         self.differential = False
 
     def take(self, block: Visibilities) -> Visibilities:
