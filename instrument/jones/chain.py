@@ -122,7 +122,8 @@ class Chain(Component):
         places = [t.maps[1] for t in self.terms[:1]] + [t.maps[0] for t in self.terms]
         raise BasisError(
             f"{type(term).__name__} takes '{takes}' and gives '{gives}', which fits nowhere in the chain "
-            f"{', '.join(type(t).__name__ for t in self.terms)}, whose bases are {', '.join(map(repr, places))}"
+            f"{', '.join(type(t).__name__ for t in self.terms)}, whose bases are {', '.join(map(repr, places))}: "
+            "give one that takes and gives one of these"
         )
 
     def _outer_count(self) -> int:

@@ -82,6 +82,9 @@ class SceneFile(Component):
             settings["terms"] = _terms(settings["terms"], self.seed)
         with _in_table("instrument"):
             found: Instrument = load("telescopes", name, **settings)
+        for label, term in zip(self.instrument.get("terms", ()), found.terms, strict=True):
+            with _in_table(f"instrument.terms.{label}"):
+                found.with_fields(terms=(term,)).chain()  # a term that fits nowhere is told by its label
         return found
 
     def sky_model(self) -> Sky:
