@@ -28,6 +28,81 @@ class _Source(io.BufferedReader):
         return self.label
 
 
+class Created:
+    """A new HDF5 file; what the system says against writing is kept, and raised as `OSError` by `check` and `close`.
+
+    Where it reaches HDF5 itself, as on a full disk, hundreds of lines are printed and the process crashes as it ends.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        import h5py
+
+        self.refused: OSError | None = None
+        self.raw = open(path, "w+b", buffering=0)  # noqa: SIM115 - closed by `close`
+        self.file: Any = h5py.File(self, "w")
+
+    def write(self, data: Any) -> int:
+        """Write all of some bytes, or keep why not."""
+        left = memoryview(data).cast("B")
+        size = len(left)
+        try:
+            while len(left) and self.refused is None:
+                left = left[self.raw.write(left) :]
+        except OSError as error:
+            self.refused = error
+        return size
+
+    def truncate(self, size: int | None = None) -> int:
+        """Cut or extend the file, or keep why not."""
+        try:
+            return self.raw.truncate(size)
+        except OSError as error:
+            self.refused = self.refused or error
+            return size or 0
+
+    def read(self, size: int = -1) -> bytes | None:
+        """Read back what was written: h5py takes nothing for a file without it."""
+        return self.raw.read(size)
+
+    def readinto(self, buffer: Any) -> int | None:
+        """Read back what was written."""
+        return self.raw.readinto(buffer)
+
+    def seek(self, *where: int) -> int:
+        """Go to a place."""
+        return self.raw.seek(*where)
+
+    def tell(self) -> int:
+        """Where it is."""
+        return self.raw.tell()
+
+    def flush(self) -> None:
+        """Nothing waits here."""
+
+    def check(self) -> None:
+        """Raise what the system has said against writing, if anything, once the file is closed."""
+        if self.refused is not None:
+            self.close()
+
+    def close(self) -> None:
+        """Close the file; raises what was said against writing it."""
+        self.file.close()
+        self.raw.close()
+        if self.refused is not None:
+            raise self.refused
+
+
+@contextmanager
+def created(path: str | os.PathLike[str]) -> Iterator[Any]:
+    """A new HDF5 file, closed at the end; raises `OSError` where it could not be written whole."""
+    made = Created(path)
+    try:
+        yield made.file
+        made.check()
+    finally:
+        made.close()
+
+
 @contextmanager
 def opened(path: Any, what: str) -> Iterator[Any]:
     """The root of an HDF5 file; what is broken in it, while it is read, raises `FileError`."""

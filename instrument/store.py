@@ -51,7 +51,7 @@ def write(path: str | os.PathLike[str], blocks: Iterable[Any], overwrite: bool =
             writer.finish()
         finally:
             if writer is not None:
-                writer.file.close()
+                writer.created.close()
 
 
 def _fixed(block: Any, texts: bool = True) -> dict[str, Any]:
@@ -77,10 +77,8 @@ class StoreWriter:
     """A new file that is filled block by block; `finish` closes it."""
 
     def __init__(self, path: str | os.PathLike[str], first: Any) -> None:
-        import h5py
-
-        file = h5py.File(path, "w")
-        self.file, self.fixed = file, _fixed(first)
+        self.created = h5.Created(path)
+        self.file, self.fixed = (file := self.created.file), _fixed(first)
         self.known = first.layout, first.beam_state
         self.slots: dict[float, int] = {}
         self.channels: dict[float, int] = {}
@@ -124,6 +122,7 @@ class StoreWriter:
             here = tuple((t, f)[axis] for axis in axes)
             size = shape if len(axes) == 2 else tuple(shape[axis] for axis in axes)
             self.spread[name].put(getattr(block, name), here, size)
+        self.created.check()
 
     def _put(self, name: str, where: tuple[slice, ...], array: Any) -> None:
         found = self.file[name]
@@ -143,7 +142,7 @@ class StoreWriter:
         for name, value in self.fixed.items():
             self.file[name] = value
         self.file.attrs.update({"format": FORMAT, "version": VERSION, **written_by()})
-        self.file.close()
+        self.created.close()
 
 
 def _rows(known: dict[float, int], values: Any, what: str) -> slice:

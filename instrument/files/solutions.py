@@ -18,6 +18,7 @@ from instrument.calibrate.directional import DirectionalSolution
 from instrument.checked import checked
 from instrument.errors import FileError, InputError, did_you_mean
 from instrument.files.h5parm import AXES, KINDS, POLS, read_soltabs
+from instrument.h5 import created
 from instrument.jones.lookup import nearest
 from instrument.jones.table import JonesTable
 from instrument.observe.layout import Layout
@@ -69,9 +70,7 @@ def write_h5parm(
         history += f"\n{solution}"
     sources = _sources(clusters if there["dir"] else {"POINTING": None}, at, directions)
 
-    import h5py
-
-    with whole_file(path, overwrite) as partial, h5py.File(partial, "w") as store:
+    with whole_file(path, overwrite) as partial, created(partial) as store:
         solset = store.create_group("sol000")
         solset.attrs["h5parm_version"] = np.bytes_("1.0")
         solset["antenna"], solset["source"] = _antenna(names, at), sources

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import tempfile
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
@@ -13,7 +14,7 @@ from pydantic import Field, field_validator, model_validator
 
 from instrument.checked import checked
 from instrument.component import Component
-from instrument.errors import InputError, RefusedError
+from instrument.errors import FileError, InputError, RefusedError
 from instrument.image.cube import StokesCube
 from instrument.image.psf import Psf
 from instrument.image.weights import Density
@@ -124,13 +125,27 @@ class Kept(ImageSums):
 
     def add(self, block: Visibilities) -> None:
         """Write a block."""
-        self.writer = self.writer or StoreWriter(self.path, block)
-        self.writer.add(block)
+        with self._on_disk():
+            self.writer = self.writer or StoreWriter(self.path, block)
+            self.writer.add(block)
 
     def finish(self) -> StokesCube:
         """The images; the file is gone afterwards."""
         with self.folder:
             if self.writer is None:
                 raise RefusedError("no block of visibilities was given: nothing to image")
-            self.writer.finish()
+            with self._on_disk():
+                self.writer.finish()
             return self.imager.image(VisibilityFile(self.path))
+
+    @contextmanager
+    def _on_disk(self) -> Iterator[None]:
+        """Says of an error of the disk where blocks are kept, and how to keep them elsewhere."""
+        try:
+            yield
+        except OSError as error:
+            why = error.strerror or str(error)
+            raise FileError(
+                f"blocks for {type(self.imager).__name__} cannot be kept in {self.folder.name}: {why}; "
+                "TMPDIR names a folder with more room"
+            ) from None

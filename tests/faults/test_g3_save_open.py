@@ -1,5 +1,8 @@
 """G3: visibilities to disk and back, block by block; other files are refused in one line."""
 
+import re
+import subprocess
+import sys
 from dataclasses import replace
 
 import h5py
@@ -286,3 +289,41 @@ def test_a_beam_of_terms_that_are_not_known_here_is_said(vis, tmp_path):
     )
     with pytest.warns(ins.InstrumentWarning, match="which beam is in the data is not known here.*StrangersBeam"):
         assert ins.Visibilities.open(path).beam_state.beams is None
+
+
+FULL = """
+import resource, sys
+import numpy as np
+from astropy import units as u
+import instrument as ins
+from instrument.conformance import imagers
+from instrument.errors import FileError
+from instrument.image.base import Kept
+
+class Any(ins.AnyImager):
+    def image(self, visibilities, operator=None):
+        raise NotImplementedError
+
+vis = imagers._seen((1.0, 0.0, 0.0, 0.0))
+term = ins.JonesTable(values=np.ones((500, 2, 24, 2, 2), complex), slots_s=vis.at.slots_s[0] + np.arange(500.0),
+                      freq_hz=vis.freq_hz, stations=vis.layout.names)
+resource.setrlimit(resource.RLIMIT_FSIZE, (8000, 8000))
+kept = Kept(Any(pixels=32, pixel=1 * u.arcmin))
+saves = lambda: vis.save("x.h5"), lambda: ins.write_h5parm("s.h5", term, "full", at=vis.at), lambda: kept.add(vis)
+for save in saves:
+    try:
+        save()
+        print("saved")
+    except FileError as error:
+        print(error)
+"""
+
+
+def test_a_disk_that_is_full_is_one_line_and_no_crash_of_hdf5(tmp_path):
+    done = subprocess.run([sys.executable, "-c", FULL], cwd=tmp_path, capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0, done.stderr  # HDF5 ended by a segmentation fault
+    assert done.stderr == ""
+    lines = done.stdout.splitlines()
+    assert lines[:2] == ["x.h5 cannot be written: File too large", "s.h5 cannot be written: File too large"]
+    assert re.fullmatch(r"blocks for Any cannot be kept in .*: File too large; TMPDIR names .* room", lines[2])
+    assert not any(tmp_path.iterdir())

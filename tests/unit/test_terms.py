@@ -98,7 +98,9 @@ def test_a_term_that_fits_nowhere_is_refused_with_the_bases_of_the_chain():
 
 def test_a_term_of_a_scene_that_fits_nowhere_is_told_by_its_label_and_what_would_do():
     tables = override(read_tables("mock-grid"), ["instrument.terms.turn={kind='parallactic'}"])
-    said = r"^\[instrument.terms.turn\] Parallactic takes .* fits nowhere .*: give one that takes and gives one of these$"
+    said = (
+        r"^\[instrument.terms.turn\] Parallactic takes .* fits nowhere .*: give one that takes and gives one of these$"
+    )
     with pytest.raises(InputError, match=said):
         parse(tables).scene()
 
