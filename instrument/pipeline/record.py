@@ -81,7 +81,9 @@ def record(result: Result, tables: dict[str, Any]) -> dict[str, Any]:
             "not_modelled": [i._asdict() for i in plan.not_modelled],
         },
         "unused": result.unused,
-        "parts": {k: {n: round(v, 3) for n, v in parts.items()} for k, parts in result.parts.items() if parts},
+        "parts": {
+            k: {n: round(v, 3) for n, v in parts.items() if v > 5e-4} for k, parts in result.parts.items() if parts
+        },
         "checks": {},
         "stage_errors": {},
     }

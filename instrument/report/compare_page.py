@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 
 from instrument.errors import FileError
 from instrument.report.page import Block, Card, FigureEntry, Figures, Page, Section, Table, Text
+from instrument.report.spectra import log_numbers
 from instrument.report.style import BLUE, ORANGE, axes_of, styled
 
 TITLES = {
@@ -134,16 +135,19 @@ def two_spectra(one: Any, two: Any, wave: str, labels: tuple[str, str], ax: Axes
     """Power (N,) of two tables against their wavenumber, log-log; bins without power are left out."""
     ax = axes_of(ax, (6.4, 4.6))
     ax.set(xscale="log", yscale="log")
-    for table, label, colour, mark in zip((one, two), labels, (BLUE, ORANGE), "os", strict=True):
+    # the first is drawn larger, and seen where both are the same
+    for table, label, colour, mark, size in zip((one, two), labels, (BLUE, ORANGE), "os", (9, 4), strict=True):
         k, power = (np.asarray(table[name], float) for name in (wave, "power"))
         good = np.isfinite(k) & (k > 0) & np.isfinite(power) & (power > 0)
         known = label if good.any() else f"{label}: no power"
-        ax.plot(k[good], power[good], color=colour, marker=mark, ms=5, lw=1.4, label=known, alpha=0.85)
+        ax.plot(k[good], power[good], color=colour, marker=mark, ms=size, lw=size / 3, label=known, alpha=0.85)
     unit = one["power"].unit
     ax.set(
         xlabel=r"$k_\perp$ (1/Mpc)" if wave == "k_perp" else r"$k$ (1/Mpc)",
         ylabel=f"power ({unit:latex_inline})" if unit else "power",
     )
+    for axis, (low, high) in ((ax.xaxis, ax.get_xlim()), (ax.yaxis, ax.get_ylim())):
+        log_numbers(axis, high / low)
     ax.grid(color="#dddddd", lw=0.6)
     ax.legend(loc="upper center", bbox_to_anchor=(0.46, -0.16), ncols=2, frameon=False)
     return ax
