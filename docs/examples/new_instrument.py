@@ -31,22 +31,19 @@ class Ring(Instrument):
 
     count: Annotated[int, Field(ge=2)] = 8
     radius: Metres = 200.0
-    pitch: Metres = 1.1
     element: ElementBeam = CrossedDipole(height=0.3 * u.m)
 
     def layout(self):
-        """Stations, from offsets east, north and up of the site."""
         angle = 2 * np.pi * np.arange(self.count) / self.count
         enu = self.radius * np.stack([np.sin(angle), np.cos(angle), 0 * angle], axis=-1)
         return Layout.from_enu([f"tile{k}" for k in range(self.count)], enu * u.m, **SITE)
 
     def chain(self):
-        """Gains and feeds if given, the tile, the parallactic rotation."""
-        steps = self.pitch * (np.arange(4) - 1.5)
-        p, q = (x.ravel() for x in np.meshgrid(steps, steps))
-        dipoles = np.stack([p, q, 0 * p], axis=-1) @ self.layout().axes[0]  # local axes to ITRF
-        tile = Level(offsets_m=dipoles[None])  # one layout for all stations: (1, 16, 3)
-        return Chain(*self.receivers(), StationBeam(element=self.element, levels=(tile,)), Parallactic())
+        steps = 1.1 * (np.arange(4) - 1.5)  # m
+        p, q, up = (x.ravel() for x in np.meshgrid(steps, steps, 0.0))
+        dipoles = np.stack([p, q, up], axis=-1) @ self.layout().axes[0]  # local axes to ITRF
+        tile = StationBeam(element=self.element, levels=(Level(offsets_m=dipoles[None]),))  # all alike: (1, 16, 3)
+        return Chain(*self.receivers(), tile, Parallactic())
 
 
 if __name__ == "__main__":

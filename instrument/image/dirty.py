@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import cached_property
 from typing import Annotated, Any
 
 import numpy as np
@@ -83,11 +84,15 @@ class _Channel:
     """Images of one channel: visibilities waiting to be gridded, and what has been."""
 
     def __init__(self, freq_hz: float, pixels: int) -> None:
-        self.freq_hz = freq_hz
+        self.freq_hz, self.pixels = freq_hz, pixels
         self.waiting: list[tuple[Float, Float, Complex]] = []
         self.count = 0
-        self.sums = np.zeros((5, pixels, pixels))
         self.weight = 0.0
+
+    @cached_property
+    def sums(self) -> Float:
+        """Of I, Q, U, V and the PSF (5, N, N); there from the first gridding on."""
+        return np.zeros((5, self.pixels, self.pixels))
 
 
 class Images(ImageSums):
@@ -170,7 +175,7 @@ class Images(ImageSums):
             with np.errstate(divide="ignore", invalid="ignore"):
                 np.divide(channel.sums[:4], channel.weight, out=planes[f])
                 np.divide(channel.sums[4], channel.weight, out=psfs[f])
-            channel.sums = np.zeros((5, 0, 0))  # a sum and its image at once: twice the cube for one channel only
+            del channel.sums  # a sum and its image at once: twice the cube for one channel only
         if not any(self.channels[f].weight for f in freqs):
             raise RefusedError(f"no visibility lies within uv_range = {self.imager.uv_range} with a weight above 0")
         return StokesCube(

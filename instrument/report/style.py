@@ -12,6 +12,7 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from instrument.memory import give_back
 from instrument.report.night import night
 from instrument.report.page import FigureEntry
 from instrument.whole_file import whole_file
@@ -54,8 +55,11 @@ def drawer(folder: Path) -> Callable[..., FigureEntry]:
     """
 
     def draw(name: str, drawing: Figure | Axes, caption: str, wide: bool = False) -> FigureEntry:
-        path = save(drawing, folder / f"{name}.png")
-        return FigureEntry(path, caption, wide=wide, dark=night(figure_of(drawing)))
+        figure = figure_of(drawing)
+        entry = FigureEntry(save(figure, folder / f"{name}.png"), caption, wide=wide, dark=night(figure))
+        figure.clear()  # its parts hold each other: up to 15 MB a figure that would wait for the collector
+        give_back()
+        return entry
 
     return draw
 

@@ -122,6 +122,15 @@ def test_the_commands_of_the_readme_are_known_verbs():
         parser().parse_args(line.partition("#")[0].split()[1:])
 
 
+def test_a_section_for_each_kind_of_plugin_in_less_than_forty_lines():
+    page = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+    sections = {text.partition("\n")[0]: text for text in re.split(r"^## (?=An? new )", page, flags=re.MULTILINE)[1:]}
+    lines = {title: len(text.split("\n## ")[0].rstrip().splitlines()) for title, text in sections.items()}
+    names = ["instrument", "element beam", "Jones term", "sky", "calibrator", "imager", "engine"]
+    assert list(lines) == [f"A new {name}" for name in (*names, "foreground remover", "stage")]
+    assert max(lines.values()) < 40, lines
+
+
 def test_a_new_instrument_takes_less_than_forty_lines():
     page, script = ROOT / "docs" / "extending.md", ROOT / "docs" / "examples" / "new_instrument.py"
     text = next(text for _, text in blocks(page, "python") if "(Instrument)" in text)

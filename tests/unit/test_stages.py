@@ -28,7 +28,7 @@ def small(*settings):
 
 
 def test_a_stage_of_a_stranger_works_from_a_scene_file_in_the_plan_and_in_the_report(package, command, tmp_path):
-    site = package({"stages": {"flagged": "Flagged"}})
+    site = package({"stages": {"flagged": "Limited"}})
     words = [w for s in (*SMALL, "flagged.most=0.2") for w in ("--set", s)]
     done = command(site, "run", "mock-grid", *words, "--out", "out")
     assert done.returncode == 0, done.stderr
@@ -41,7 +41,7 @@ def test_a_stage_of_a_stranger_works_from_a_scene_file_in_the_plan_and_in_the_re
     assert "<td>flagged</td>" in re.sub(r"<td[^>]*><span>(.*?)</span></td>", r"<td>\1</td>", page)
     wrong = command(site, "run", "mock-grid", *words, "--set", "flagged.mots=1")
     assert wrong.returncode == 2 and wrong.stderr.count("\n") == 1
-    assert "[flagged] Flagged has no 'mots': did you mean 'most'" in wrong.stderr
+    assert "[flagged] Limited has no 'mots': did you mean 'most'" in wrong.stderr
     assert "flagged" in command(site, "plugins").stdout
 
 

@@ -14,7 +14,7 @@ POINTS = {
     "calibrators": {"alternating": "Alternating"},
     "imagers": {"summed": "Summed"},
     "foregrounds": {"flat-leakage": "FlatLeakage"},
-    "stages": {"flagged": "Flagged"},
+    "stages": {"flagged": "Limited"},
 }
 SCENE = """
 name = "strange"

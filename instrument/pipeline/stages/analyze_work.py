@@ -55,11 +55,7 @@ def cube_products(settings: CubeAnalysis, channels: int, pixels: int) -> StageWo
     if settings.depths is not None and len(settings.depths) == 3:
         first, last, step = settings.depths
         depths = int((last - first) / step) + 1
-    seconds, held, most, figures = 0.0, 4 * 8 * voxels, 0.0, 0
-    if settings.wants("faraday") and channels > 1:
-        seconds += 2.5e-10 * channels * depths * pixels * (40 if settings.clean else 1) + 2e-8 * depths * pixels
-        held += 16.0 * depths * pixels * (4 if settings.clean else 1)
-        figures += 3
+    seconds, held, most, figures = 0.0, 0.0, 0.0, 0
     if settings.wants("spectrum-2d"):
         seconds += 3 * 4e-7 * pixels
         most, figures = max(most, 200.0 * pixels), figures + 1
@@ -72,8 +68,14 @@ def cube_products(settings: CubeAnalysis, channels: int, pixels: int) -> StageWo
     if settings.wants("window"):
         seconds += 3 * 2e-7 * voxels
         figures += 1
+    peak = held + most + 4 * 8 * voxels  # in kelvin
+    if settings.wants("faraday") and channels > 1:  # after them
+        seconds += 2.5e-10 * channels * depths * pixels * (40 if settings.clean else 1) + 2e-8 * depths * pixels
+        held += 8.0 * depths * pixels * (4 if settings.clean else 1)
+        peak = max(peak, held + 2.0 * depths * pixels)
+        figures += 3
     text = "all products" if settings.products is None else ", ".join(settings.products) or "nothing"
-    return StageWork(f"of the cube: {text}", finish_seconds=seconds, finish_bytes=held + most, result_bytes=held,
+    return StageWork(f"of the cube: {text}", finish_seconds=seconds, finish_bytes=peak, result_bytes=held,
                      figures=figures, remedy="ask for fewer pixels, channels or depths")  # fmt: skip
 
 

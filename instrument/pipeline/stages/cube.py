@@ -21,7 +21,8 @@ from instrument.component import Component
 from instrument.errors import InputError, InstrumentWarning, unused, warn
 from instrument.foreground.base import ForegroundRemover
 from instrument.image.cube import StokesCube
-from instrument.memory import afford
+from instrument.image.present import has_beam, middle_channel, stokes_of
+from instrument.memory import afford, give_back
 from instrument.pipeline.stages.cube_page import CubeResults
 from instrument.registry import load
 from instrument.units import Count, Finite, Float, NotNegative, Positive, PositiveSeconds, Radians, Real, UvRange
@@ -142,7 +143,7 @@ class CubeAnalysis(Component):
         missing = self._missing(cube, there)
         if missing is not None:
             out = dict.fromkeys(("cylindrical", "spherical", "window"), missing) | out
-        if cube.unit == "Jy/beam" and not _has_beam(cube):
+        if cube.unit == "Jy/beam" and not has_beam(cube):
             text = f"the cube is in {cube.unit} and its beam is not known: give the beam (--beam), or the cube in K"
             out.setdefault("window", text)
         if self.remove is not None and len(cube.freq_hz) < 2:
@@ -206,27 +207,39 @@ class CubeAnalysis(Component):
         for name in "IQUV":
             if name not in stokes_of(cube):
                 result.left_out[f"Stokes {name}"] = "no data, or zero everywhere"
-        kelvin = cube.to_kelvin() if cube.unit == "Jy/pixel" or _has_beam(cube) else cube
         self._unused(wanted, noise)
-        if noise is not None and noise.unit != kelvin.unit:
-            noise = noise.to_kelvin()
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always", InstrumentWarning)
-            if "faraday" in wanted:
+            self._in_kelvin(cube, noise, wanted, result, progress)
+            if "faraday" in wanted:  # the largest comes last, when what the spectra took is free again
+                give_back()
                 self._faraday(cube, result)
-            progress(0.3)
-            if self.remove is not None:
-                self._split(kelvin, result)
-            progress(0.6)
-            self._spectra(kelvin, wanted, result)
-            progress(0.8)
-            if "window" in wanted:
-                self._window(kelvin, noise, result)
             progress(1.0)
         for text in dict.fromkeys(str(w.message) for w in said if issubclass(w.category, InstrumentWarning)):
             result.warned.append(text)
             warn(text)
         return result
+
+    def _in_kelvin(
+        self,
+        cube: StokesCube,
+        noise: StokesCube | None,
+        wanted: list[Product],
+        result: CubeResults,
+        progress: Callable[[float], None],
+    ) -> None:
+        """What is made of temperatures: removal, spectra and the window."""
+        kelvin = cube.to_kelvin() if cube.unit == "Jy/pixel" or has_beam(cube) else cube
+        if noise is not None and noise.unit != kelvin.unit:
+            noise = noise.to_kelvin()
+        if self.remove is not None:
+            self._split(kelvin, result)
+        progress(0.3)
+        self._spectra(kelvin, wanted, result)
+        progress(0.5)
+        if "window" in wanted:
+            self._window(kelvin, noise, result)
+        progress(0.7)
 
     def _unused(self, wanted: list[Product], noise: StokesCube | None) -> None:
         """Name the settings that no product uses."""
@@ -291,7 +304,7 @@ class CubeAnalysis(Component):
             analyzer = Analyzer(one)
             if "spectrum-2d" in wanted:
                 with result.timed("2D spectra"):
-                    middle = _middle(one, "Q" if stokes == "P" else stokes)
+                    middle = middle_channel(one, "Q" if stokes == "P" else stokes)
                     result.planes[name] = analyzer.spectrum_2d(
                         stokes, middle, self.uv_range, self.taper_space, redshift=self.redshift
                     )
@@ -327,23 +340,3 @@ class CubeAnalysis(Component):
         from astropy import units as u
 
         return None if self.infill is None else self.infill * u.s
-
-
-def stokes_of(cube: StokesCube) -> list[str]:
-    """Stokes parameters that a cube has: with data, and not zero everywhere."""
-    return [name for k, name in enumerate("IQUV") if any(np.nan_to_num(plane[k]).any() for plane in cube.data)]
-
-
-def _has_beam(cube: StokesCube) -> bool:
-    """Whether every channel with data has a beam."""
-    if cube.psf is None:
-        return False
-    known = np.isfinite(cube.psf.solid_angle_sr)
-    return all(has or not np.isfinite(planes).any() for has, planes in zip(known, cube.data, strict=True))
-
-
-def _middle(cube: StokesCube, stokes: str) -> int:
-    """The middle one of the channels that have data."""
-    plane = cube.data[:, "IQUV".index(stokes)]
-    there = [k for k in np.argsort(cube.freq_hz, kind="stable") if np.isfinite(plane[k]).any()]
-    return int(there[len(there) // 2])
