@@ -38,6 +38,10 @@ class Solution:
     fit of an interval: `data.flagged(solution.suspects)`, and solve again; `spoilt` counts them by baseline.
     `unexplained` (t, f) is the largest of `residual`, the same without the strongest baselines, and that of a typical
     baseline, times what J^-1 magnifies it by. `doubts` are sentences about all this, printed with a solution.
+
+    `error` (t, f, A, 2, 2) is the standard error of the real part, and of the imaginary part, of every gain that noise
+    makes, once `aligned` has used what is free or weak; `common_error` (t, f, n) those of the common directions
+    x_k of exp(sum_k x_k G_k), largest first, infinite where they are free. Both NaN where they are not known.
     """
 
     __repr__ = short_repr
@@ -53,6 +57,8 @@ class Solution:
     spoilt: Mapping[str, int] = field(default_factory=dict)
     unexplained: Float = field(default_factory=lambda: np.zeros((1, 1)))
     notes: tuple[str, ...] = ()
+    error: Float = field(default_factory=lambda: np.full((1, 1, 1, 2, 2), np.nan))
+    common_error: Float = field(default_factory=lambda: np.full((1, 1, 1), np.nan))
 
     @property
     def jones(self) -> Complex:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
@@ -27,12 +27,14 @@ class Gauge:
     """Null space of a solve: X = exp(sum_k x_k G_k) with G (n, 2, 2), common to all stations.
 
     `seen` is how strongly the model constrains each common direction, relative to its power, weakest first: exactly
-    zero is a gauge freedom, a small number is a direction that noise will fill.
+    zero is a gauge freedom, a small number is a direction that noise will fill. Those that noise fills beyond what a
+    solve holds near its start are `weak` (m, 2, 2): generators as well, which `nearest` turns along too.
     """
 
     generators: Complex
     seen: Float
     pattern: str
+    weak: Complex = field(default_factory=lambda: np.zeros((0, 2, 2), complex))
 
     @property
     def count(self) -> int:
@@ -45,6 +47,11 @@ class Gauge:
         return bool(np.abs(self.generators + np.conj(np.swapaxes(self.generators, 1, 2))).max(initial=0.0) < 1e-9)
 
     def __str__(self) -> str:
+        many = len(self.weak)
+        what = "1 common direction is" if many == 1 else f"{many} common directions are"
+        return self._free() + (f"; {what} weaker than the noise, and held near the start" if many else "")
+
+    def _free(self) -> str:
         if self.count == 4 and self.unitary:
             return "free: a unitary matrix common to all stations (the model is unpolarized)"
         names = {
@@ -60,21 +67,22 @@ class Gauge:
         good: Any = np.isfinite(jones).all(axis=(-2, -1)) & np.isfinite(to).all(axis=(-2, -1))
         a, b = (np.where(good[..., None, None], x, 0.0) for x in (jones, to))
         x = np.broadcast_to(np.eye(2, dtype=complex), (*a.shape[:-3], 2, 2)).copy()
-        if self.count == 0:
+        generators = np.concatenate([self.generators, self.weak])
+        if not len(generators):
             return x
-        if self.count == 4 and self.unitary:
+        if self.count == 4 and self.unitary and not len(self.weak):
             u, _, vh = np.linalg.svd(np.einsum("...aji,...ajk->...ik", a.conj(), b))  # of sum J^H T
             return np.asarray(u @ vh)
         from scipy.linalg import expm
 
         for _ in range(50):  # Gauss-Newton on the few parameters, from the left over of T - J X
             turned = a @ x[..., None, :, :]
-            moves = np.einsum("...aij,njk->...naik", turned, self.generators)
+            moves = np.einsum("...aij,njk->...naik", turned, generators)
             left = (b - turned)[..., None, :, :, :]
             gradient = np.einsum("...naij,...naij->...n", moves.conj(), np.broadcast_to(left, moves.shape)).real
             gram = np.einsum("...naij,...maij->...nm", moves.conj(), moves).real
-            y = np.linalg.solve(gram + 1e-14 * np.eye(self.count), gradient[..., None])[..., 0]
-            x = x @ expm(np.einsum("...n,nij->...ij", y, self.generators))
+            y = np.linalg.solve(gram + 1e-14 * np.eye(len(generators)), gradient[..., None])[..., 0]
+            x = x @ expm(np.einsum("...n,nij->...ij", y, generators))
             if np.abs(y).max() < 1e-13:
                 break
         return x
