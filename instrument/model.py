@@ -215,6 +215,6 @@ def warn_outside_band(chain: Chain, freq_hz: Float) -> None:
         outside = freq_hz[(freq_hz < low) | (freq_hz > high)]
         if outside.size:
             warn(
-                f"{type(term).__name__} was made for {low / 1e6:g} to {high / 1e6:g} MHz: it extrapolates at "
+                f"{term.called} was made for {low / 1e6:g} to {high / 1e6:g} MHz: it extrapolates at "
                 f"{outside.min() / 1e6:g} MHz" + (f" to {outside.max() / 1e6:g} MHz" if outside.size > 1 else "")
             )

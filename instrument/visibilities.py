@@ -321,7 +321,7 @@ class Visibilities(VisibilitySet):
         spread = [t for t in (term.parts if isinstance(term, Chain) else term.parts()) if t.directional]
         if spread:
             raise InputError(
-                f"{type(spread[0]).__name__} differs between directions: visibilities can be corrected towards one "
+                f"{spread[0].called} differs between directions: visibilities can be corrected towards one "
                 "direction only; use Towards(chain=...)"
             )
         return found[:, :, :, 0]

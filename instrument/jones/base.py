@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
@@ -58,9 +58,18 @@ class JonesTerm(Component):
         """The factor (T, F, A, S) of a term whose structure is "scalar"."""
         return self.jones(at)[..., 0, 0]
 
+    @property
+    def called(self) -> str:
+        """What text calls the term."""
+        return type(self).__name__
+
     def parts(self) -> tuple[JonesTerm, ...]:
         """The terms this one is the product of, receiver to sky; itself unless it is a composite."""
         return (self,)
+
+    def in_chain(self) -> JonesTerm:
+        """What a chain multiplies for the term: itself, but for elements, which have a sign of time of their own."""
+        return self
 
     def phasors(self) -> int:
         """How many sines and cosines it takes for each time, channel and direction: what an engine plans with."""
@@ -87,9 +96,9 @@ class JonesTerm(Component):
     def sharing(self, at: Sampling) -> str:
         """How many different matrices the stations of an array need of this term, in words."""
         if self.per_station == "own":
-            return f"{type(self).__name__} one per station"
+            return f"{self.called} one per station"
         sizes = [len(at.layout)] if self.per_station == "shared" else np.bincount(at.layout.frames[1])
-        return f"{type(self).__name__} shared by {'+'.join(str(n) for n in sorted(sizes, reverse=True))} stations"
+        return f"{self.called} shared by {'+'.join(str(n) for n in sorted(sizes, reverse=True))} stations"
 
     def simplify(self, at: Sampling, tolerance: NotNegative) -> Simplified:
         """What a scene needs of this term: itself, something simpler, or nothing; its bound is below `tolerance`."""
@@ -117,12 +126,21 @@ class ElementBeam(JonesTerm):
 
     A subclass gives `jones`; `at.zenith_angle` and `at.azimuth_cos_sin` are in the axes of each station. Columns are
     the field along e_theta (away from the zenith) and e_phi (azimuth increasing from p, east, to q, north).
+
+    `jones` is as electromagnetic codes and EveryBeam give it, for fields exp(+i omega t). The fringe is of
+    exp(-i omega t): a chain and a `StationBeam` take the conjugate (`in_chain`), here and nowhere else. `real` promises
+    that there is nothing to conjugate.
     """
 
     plugin_kind: ClassVar[str | None] = "elements"
     maps: ClassVar[tuple[Basis, Basis]] = ("horizon", "feed")
     per_station: ClassVar[PerStation] = "frame"
     blind_below_horizon: ClassVar[bool] = True
+    real: ClassVar[bool] = False
+
+    def in_chain(self) -> ElementBeam:
+        """The element with the sign of the fringe: itself if it is real, or its conjugate."""
+        return self if self.real else Conjugate(element=self)
 
     def band_hz(self) -> tuple[float, float]:
         """Frequencies between which the model was made; outside it extrapolates."""
@@ -136,3 +154,52 @@ class ElementBeam(JonesTerm):
         """
         peak = self.peak(at)
         return 4 * (peak if np.isfinite(peak) else 1.0)
+
+
+@checked
+class Conjugate(ElementBeam):
+    """An element with the sign of the fringe, (T, F, A, S, 2, 2): the conjugate of what its maker gives."""
+
+    element: ElementBeam
+
+    def model_post_init(self, context: Any, /) -> None:
+        """Its promises are those of the element."""
+        for promise in ("maps", "structure", "per_station", "directional", "blind_below_horizon"):
+            object.__setattr__(self, promise, getattr(self.element, promise))
+
+    @property
+    def called(self) -> str:
+        """The element's name: there is no other effect in it."""
+        return self.element.called
+
+    def in_chain(self) -> ElementBeam:
+        """Itself: it is not turned twice."""
+        return self
+
+    def band_hz(self) -> tuple[float, float]:
+        """That of the element."""
+        return self.element.band_hz()
+
+    def phasors(self) -> int:
+        """Those of the element."""
+        return self.element.phasors()
+
+    def peak(self, at: Sampling) -> float:
+        """That of the element."""
+        return self.element.peak(at)
+
+    def rounding(self, at: Sampling) -> Float:
+        """That of the element."""
+        return self.element.rounding(at)
+
+    def jump(self, at: Sampling) -> float:
+        """That of the element."""
+        return self.element.jump(at)
+
+    def sharing(self, at: Sampling) -> str:
+        """That of the element."""
+        return self.element.sharing(at)
+
+    def jones(self, at: Sampling) -> Complex:
+        """The conjugate of the element's matrices, (T, F, A, S, 2, 2)."""
+        return self.element.jones(at).conj()

@@ -59,9 +59,14 @@ class Chain(Component):
         return self
 
     @cached_property
+    def multiplied(self) -> tuple[JonesTerm, ...]:
+        """The terms as they are multiplied, all with the sign of the fringe: elements conjugated."""
+        return tuple(term.in_chain() for term in self.terms)
+
+    @cached_property
     def parts(self) -> tuple[JonesTerm, ...]:
-        """The terms with composites taken apart."""
-        return tuple(p for term in self.terms for p in term.parts())
+        """The same with composites taken apart."""
+        return tuple(p for term in self.multiplied for p in term.parts())
 
     @property
     def structure(self) -> Structure:
@@ -77,7 +82,7 @@ class Chain(Component):
         """The plain product of the terms, (T, F, A, S, 2, 2), length 1 where constant: the definition."""
         if not self.terms:
             return np.array(mat2.IDENTITY).reshape(1, 1, 1, 1, 2, 2)
-        return reduce(mat2.mul, (term.jones(at) for term in self.terms))
+        return reduce(mat2.mul, (term.jones(at) for term in self.multiplied))
 
     def shares(self, layout: Any) -> int:
         """Number G of different shared matrices for the stations of `layout`."""

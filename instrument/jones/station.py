@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import model_validator
@@ -18,6 +18,7 @@ from instrument.observe.sampling import Sampling
 from instrument.phasor import array_factor
 from instrument.units import ArrayOf, Complex, Float, Int, PositiveHertz, SkyDirection
 
+Phase = Literal["fringe", "everybeam"]
 Offsets = Annotated[Any, ArrayOf(float, (None, None, 3))]
 
 
@@ -48,25 +49,28 @@ class Level(Component):
 
 @checked
 class ArrayFactor(ScalarTerm):
-    """Product over levels of mean exp(2 pi i (f d - f0 d0) . r / c), complex (T, F, A, S); 1 at the pointing.
+    """Product over levels of mean exp(-2 pi i (f d - f0 d0) . r / c), complex (T, F, A, S); 1 at the pointing.
 
     d is the apparent direction, d0 the pointing of the level, f0 the channel frequency, or `reference_frequency` where
     a beam former works with one set of phases for a whole band. The same factor for both receptors. Not clipped at the
-    horizon. Source: docs/conventions.md; checked against EveryBeam in tests/peers.
+    horizon. `phase` "fringe" has the sign of the fringe, so that a station is the mean of its parts; "everybeam" is the
+    conjugate, as EveryBeam has it. Source: docs/conventions.md; checked against EveryBeam in tests/peers.
     """
 
     maps: ClassVar[tuple[Basis, Basis]] = ("feed", "feed")
     levels: tuple[Level, ...]
     reference_frequency: PositiveHertz | None = None
+    phase: Phase = "fringe"
 
     def scalar(self, at: Sampling) -> Complex:
         """The array factor (T, F, A, S)."""
         out: Any = np.ones((1, 1, 1, 1))
         times, channels, _, sources = at.shape
+        light = -LIGHT if self.phase == "fringe" else LIGHT
         for level in self.levels:
             steer = at.centre_itrf if level.pointing is None else at.earth.itrf(level.pointing.vector[None])[:, 0]
             f0 = np.full(channels, self.reference_frequency) if self.reference_frequency else at.freq_hz
-            waves = (at.freq_hz[:, None, None] * at.itrf[:, None] - (f0[:, None] * steer[:, None])[:, :, None]) / LIGHT
+            waves = (at.freq_hz[:, None, None] * at.itrf[:, None] - (f0[:, None] * steer[:, None])[:, :, None]) / light
             offsets, which = level.distinct
             if len(which) not in (1, len(at.layout)):
                 raise InputError(f"a level holds {len(which)} stations, the array has {len(at.layout)}")
@@ -105,7 +109,11 @@ class ArrayFactor(ScalarTerm):
 
 @checked
 class StationBeam(JonesTerm):
-    """A phased station, horizon to feed, (T, F, A, S, 2, 2): `ArrayFactor` times the element's pattern."""
+    """A phased station, horizon to feed, (T, F, A, S, 2, 2): `ArrayFactor` times the element's pattern.
+
+    `phase` "fringe" gives array factor and element the sign of the fringe: a station is the mean of its elements.
+    "everybeam" is the conjugate of both, as EveryBeam and DP3 have them beside the fringe of LOFAR sets.
+    """
 
     maps: ClassVar[tuple[Basis, Basis]] = ("horizon", "feed")
     per_station: ClassVar[PerStation] = "own"
@@ -114,6 +122,7 @@ class StationBeam(JonesTerm):
     element: ElementBeam
     levels: tuple[Level, ...]
     reference_frequency: PositiveHertz | None = None
+    phase: Phase = "fringe"
 
     @cached_property
     def array(self) -> ArrayFactor:
@@ -121,11 +130,16 @@ class StationBeam(JonesTerm):
         from astropy import units as u
 
         reference = self.reference_frequency and self.reference_frequency * u.Hz
-        return ArrayFactor(levels=self.levels, reference_frequency=reference)
+        return ArrayFactor(levels=self.levels, reference_frequency=reference, phase=self.phase)
+
+    @cached_property
+    def pattern(self) -> ElementBeam:
+        """The element with the sign of the array factor: as it is for "everybeam"."""
+        return self.element.in_chain() if self.phase == "fringe" else self.element
 
     def parts(self) -> tuple[JonesTerm, ...]:
-        """(ArrayFactor, element)."""
-        return (self.array, *self.element.parts())
+        """(ArrayFactor, element), the element alone where there is no level."""
+        return ((self.array,) if self.levels else ()) + self.pattern.parts()
 
     def peak(self, at: Sampling) -> float:
         """That of the element: an array factor is at most 1."""
@@ -133,4 +147,4 @@ class StationBeam(JonesTerm):
 
     def jones(self, at: Sampling) -> Complex:
         """Array factor times element, (T, F, A, S, 2, 2)."""
-        return np.asarray(self.array.scalar(at)[..., None, None] * self.element.jones(at))
+        return np.asarray(self.array.scalar(at)[..., None, None] * self.pattern.jones(at))

@@ -50,7 +50,7 @@ def known_gain(chain: Chain, at: Sampling) -> float:
 
 def unknown_peaks(problem: Problem) -> list[str]:
     """Terms whose size no bound is known of; the rounding takes 1."""
-    return [type(t).__name__ for t in problem.chain.parts if not np.isfinite(t.peak(problem.at))]
+    return [t.called for t in problem.chain.parts if not np.isfinite(t.peak(problem.at))]
 
 
 def _cells(problem: Problem) -> list[Problem]:

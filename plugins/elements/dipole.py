@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -22,6 +22,7 @@ class CrossedDipole(ElementBeam):
     Closed form of image theory (for example Balanis, Antenna Theory, chapter 4). Zero below the plane.
     """
 
+    real: ClassVar[bool] = True
     height: Annotated[Metres, Field(gt=0)]
     x_azimuth: Radians = 0.0
 

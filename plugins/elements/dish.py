@@ -27,6 +27,7 @@ class Airy(ElementBeam):
     """
 
     structure: ClassVar[Structure] = "scalar"
+    real: ClassVar[bool] = True
     diameter: Annotated[Metres, Field(gt=0)]
 
     def peak(self, at: Sampling) -> float:
@@ -58,6 +59,7 @@ class Gaussian(ElementBeam):
     """
 
     structure: ClassVar[Structure] = "scalar"
+    real: ClassVar[bool] = True
     fwhm: Annotated[Radians, Field(gt=0)]
     frequency: Hertz | None = None
 

@@ -20,7 +20,8 @@ class Hamaker(ElementBeam):
 
     p_d(theta, x) = sum_ij C[k, i, j, d] theta^i x^j with x = (f - f0) / df, and
     J = sum_k [[cos a p_theta, -sin a p_phi], [sin a p_theta, cos a p_phi]], a = (-1)^k (2k+1) phi, phi from the +X
-    dipole. The minus sign on p_phi of Hamaker (2011) is already in the distributed coefficients. Zero at and below the
+    dipole. The minus sign on p_phi of Hamaker (2011) is already in the distributed coefficients, which are those of
+    fields exp(+i omega t). Zero at and below the
     antenna plane; outside its band it extrapolates. At the zenith the second harmonic leaves a jump of 2e-3 in azimuth,
     which is the model's own.
     """

@@ -14,7 +14,7 @@ from instrument.errors import InputError, did_you_mean
 from instrument.jones.base import ElementBeam
 from instrument.jones.chain import Chain
 from instrument.jones.parallactic import Parallactic
-from instrument.jones.station import ArrayFactor, Level, StationBeam
+from instrument.jones.station import ArrayFactor, Level, Phase, StationBeam
 from instrument.model import Instrument
 from instrument.numbers import brief
 from instrument.observe.layout import Layout
@@ -34,6 +34,7 @@ class _Lofar(Instrument):
     beam_kind: Literal["full", "element", "array-factor"] | None = Field(default="full", alias="beam")
     beam_pointing: SkyDirection | None = None
     reference_frequency: PositiveHertz | None = None
+    phase: Phase = "fringe"
 
     @field_validator("beam_kind", mode="before")
     @classmethod
@@ -82,15 +83,14 @@ class _Lofar(Instrument):
         reference = self.reference_frequency and self.reference_frequency * u.Hz
         if self.beam_kind is None:
             return Chain(*self.receivers())
-        if self.beam_kind == "element":
+        if self.beam_kind == "element" and self.phase == "fringe":
             return Chain(*self.receivers(), element, Parallactic())
         if self.beam_kind == "array-factor":
-            return Chain(*self.receivers(), ArrayFactor(levels=levels, reference_frequency=reference))
-        return Chain(
-            *self.receivers(),
-            StationBeam(element=element, levels=levels, reference_frequency=reference),
-            Parallactic(),
-        )
+            alone = ArrayFactor(levels=levels, reference_frequency=reference, phase=self.phase)
+            return Chain(*self.receivers(), alone)
+        levels = levels if self.beam_kind == "full" else ()
+        station = StationBeam(element=element, levels=levels, reference_frequency=reference, phase=self.phase)
+        return Chain(*self.receivers(), station, Parallactic())
 
 
 class LofarHBA(_Lofar):
@@ -100,7 +100,8 @@ class LofarHBA(_Lofar):
     "full" (element, tiles and station), "element", "array-factor" or `None` (feeds along north and east), `tiles`
     "surveyed" or "ideal" (the 5.15 m lattice: stations with one tile rotation then share their array factor, at an
     error of 1.5e-4 of the peak within 10 deg, 4.5e-4 for CS401HBA1), `tile_pointing` and `beam_pointing` (the phase
-    centre by default).
+    centre by default), `phase` "fringe" (a station is the mean of its dipoles) or "everybeam" (as EveryBeam, and DP3 on
+    LOFAR sets, have it: array factor and element conjugated).
     """
 
     station_file: ClassVar[str] = "lofar_hba_stations.ecsv"
