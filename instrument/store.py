@@ -16,7 +16,9 @@ from instrument import h5
 from instrument.beam_state import BeamState
 from instrument.errors import BeamStateError, FileError, InputError, warn
 from instrument.files_in import harmless
+from instrument.jones.base import ElementBeam, JonesTerm
 from instrument.jones.chain import Chain
+from instrument.jones.station import StationBeam
 from instrument.memory import afford
 from instrument.observe.directions import EarthFrame
 from instrument.observe.layout import Layout
@@ -25,7 +27,8 @@ from instrument.provenance import written_by
 from instrument.units import Direction
 from instrument.whole_file import whole_file
 
-FORMAT, VERSION = "instrument visibilities", 1
+FORMAT, VERSION = "instrument visibilities", 2
+KNOWN = (1, 2)  # in 1 array factors and elements are those of EveryBeam and have no `phase`
 WHAT = "file of visibilities"
 CHUNK_BYTES = 1e6  # of data that HDF5 reads at once
 # of times, by name: where it is found in visibilities, and its axes behind the times
@@ -211,7 +214,7 @@ class Store:
             raise FileError(f"{self.name}: times, frequencies or coordinates are not finite, or not above 0")
         try:
             self.layout = Layout.from_json(texts["layout"])
-            self.beam_state = _state(json.loads(texts["beam_state"]), self.name)
+            self.beam_state = _state(json.loads(texts["beam_state"]), self.name, int(self.written["version"]))
         except (InputError, ValueError, LookupError, TypeError) as error:
             raise FileError(f"{self.name}: layout or beam state: {harmless(h5.one_line(error), 200)}") from None
         self.small = small
@@ -221,10 +224,8 @@ class Store:
         if h5.text(file.attrs.get("format", "")) != FORMAT:
             like = "an h5parm, which read_h5parm reads" if "sol000" in file else "another HDF5 file"
             raise FileError(f"{self.name} is no {WHAT} (Visibilities.save): it is {like}")
-        if (version := int(file.attrs.get("version", 0))) != VERSION:
-            raise FileError(
-                f"{self.name}: version {version} of the format, and {VERSION} is known: take a newer program"
-            )
+        if (version := int(file.attrs.get("version", 0))) not in KNOWN:
+            raise FileError(f"{self.name}: version {version} of the format is not one of {KNOWN}: take a newer program")
         there = h5.members(file)
         needed = ("data", "freq_hz", *PER_TIME[:3], *FIXED, "weight", "flag", "interval_s")
         known = [n for n in ("data", "freq_hz", *PER_TIME, *FIXED, *SPREAD) if n in needed or n in there]
@@ -283,12 +284,29 @@ def _forward(step: slice, count: int, what: str) -> slice:
     return step
 
 
-def _state(told: dict[str, Any], name: str) -> BeamState:
+def _state(told: dict[str, Any], name: str, version: int) -> BeamState:
     """The beam state of a file; a chain of terms that are not known here is not known, which is said."""
     towards, beams = told["towards"] and Direction(*map(float, told["towards"])), None
     if told["beams"] is not None:
         try:
-            beams = Chain.from_json(json.dumps(told["beams"]))
+            beams = Chain.from_json(json.dumps(told["beams"] if version > 1 else _of_everybeam(told["beams"])))
+            beams = beams if version > 1 else Chain(*(_element_of_everybeam(term) for term in beams.terms))
         except InputError as error:
             warn(f"{name}: which beam is in the data is not known here: {harmless(h5.one_line(error), 200)}")
     return BeamState(told["removed"], towards, beams, bool(told["other"]))
+
+
+def _of_everybeam(told: Any) -> Any:
+    """The text of a chain with the `phase` that array factors and stations had when there was no other."""
+    if isinstance(told, list):
+        return [_of_everybeam(item) for item in told]
+    if not isinstance(told, dict):
+        return told
+    found = {name: _of_everybeam(item) for name, item in told.items()}
+    return {"phase": "everybeam", **found} if "levels" in found else found
+
+
+def _element_of_everybeam(term: JonesTerm) -> JonesTerm:
+    """An element by itself was multiplied as it is: now that is a station of no level."""
+    alone = isinstance(term, ElementBeam) and not term.real
+    return StationBeam(element=term, levels=(), phase="everybeam") if alone else term

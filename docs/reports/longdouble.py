@@ -9,6 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from instrument import ElementBeam
+
 LIGHT = np.longdouble(299792458)
 PI = np.longdouble("3.14159265358979323846264338327950288")
 I = np.clongdouble(1j)
@@ -197,6 +199,7 @@ def hamaker(term, at, g):
 
 
 def array_factor(term, at, g):
+    sign = -1 if term.phase == "fringe" else 1
     f, out = real(at.freq_hz)[None, :, None, None], np.clongdouble(1)
     for level in term.levels:
         steer = g.centre
@@ -205,12 +208,13 @@ def array_factor(term, at, g):
         f0 = real(term.reference_frequency) if term.reference_frequency else f
         waves = (f * g.seen[:, None] - f0 * steer[:, None, None]) / LIGHT  # (T, F, S, 3)
         cycles = sum(real(level.offsets_m)[None, None, :, :, None, k] * waves[:, :, None, None, :, k] for k in range(3))
-        out = out * cis(cycles).mean(3)
+        out = out * cis(sign * cycles).mean(3)
     return matrix(out, 0, 0, out)
 
 
 def station_beam(term, at, g):
-    return product(array_factor(term.array, at, g), of_term(term.element, at, g))
+    element = of_term(term.element, at, g)
+    return product(array_factor(term.array, at, g), element.conj() if term.phase == "fringe" else element)
 
 
 TERMS = {
@@ -279,7 +283,9 @@ def visibilities(problem):
     g = geometry(at)
     jones = matrix(1, 0, 0, 1)
     for term in problem.chain.terms:
-        jones = product(jones, of_term(term, at, g))
+        found = of_term(term, at, g)
+        # an element is given for exp(+i omega t), the fringe is of exp(-i omega t)
+        jones = product(jones, found.conj() if isinstance(term, ElementBeam) else found)
     jones = np.broadcast_to(jones, (*at.shape, 2, 2))
     i, q, u, v = np.moveaxis(stokes(sky, at.freq_hz), -1, 0)
     bright = matrix(i + q, u + I * v, u - I * v, i - q)[None]

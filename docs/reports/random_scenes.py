@@ -111,6 +111,10 @@ def _receivers(rng):
     return gain, feed
 
 
+def _phase(rng):
+    return ["fringe", "everybeam"][rng.spawn(1)[0].integers(2)]  # a child: what is drawn next stays what it was
+
+
 def _lofar(rng, kind):
     names = instrument.load("telescopes", kind).stations
     gain, feed = _receivers(rng)
@@ -124,6 +128,7 @@ def _lofar(rng, kind):
         beam=[None, "full", "element", "array-factor", "full"][rng.integers(5)],
         beam_pointing=elsewhere if rng.random() < 0.3 else None,
         reference_frequency=150 * u.MHz if rng.random() < 0.3 else None,
+        phase=_phase(rng),
     )
 
 
@@ -149,7 +154,7 @@ def _composed(rng, kind, latitude):
         element = [CrossedDipole(height=0.5 * u.m), Hamaker(), Airy(diameter=5 * u.m)][rng.integers(3)]
         own = count if rng.random() < 0.5 else 1
         offsets = rng.normal(size=(own, int(rng.integers(1, 12)), 3)) * 10 ** rng.uniform(-1, 2)
-        terms += [StationBeam(element=element, levels=(Level(offsets_m=offsets),)), Parallactic()]
+        terms += [StationBeam(element=element, levels=(Level(offsets_m=offsets),), phase=_phase(rng)), Parallactic()]
     if rng.random() < 0.3:
         terms.insert(0, Screen(slope=rng.uniform(-30, 30)))
     if rng.random() < 0.3 and kind != "bare":

@@ -189,13 +189,13 @@ def _icrs(earth: EarthFrame, itrf: Float) -> tuple[Float, Float]:
 
 
 class _Dipole(ElementBeam):
-    """Two short crossed dipoles in free space above the antenna plane."""
+    """Two short crossed dipoles in free space above the antenna plane; complex: half a turn from zenith to horizon."""
 
     def jones(self, at: Sampling) -> Complex:
         """The field along p and q, (T, 1, A, S, 2, 2)."""
         cos, sin = at.azimuth_cos_sin
         tilt = np.maximum(at.local[..., 2], 0.0)
-        up = (at.zenith_angle < np.pi / 2)[..., None, None]
+        up = ((at.zenith_angle < np.pi / 2) * np.exp(1j * np.pi * tilt))[..., None, None]
         return (up * mat2.pack(tilt * cos, -sin, tilt * sin, cos))[:, None]
 
 

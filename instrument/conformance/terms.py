@@ -19,7 +19,7 @@ from instrument.conformance.bench import (
     demand_same,
     hard_places,
 )
-from instrument.jones.base import Basis, JonesTerm, PerStation, Structure
+from instrument.jones.base import Basis, ElementBeam, JonesTerm, PerStation, Structure
 from instrument.observe.sampling import Sampling
 
 
@@ -81,6 +81,15 @@ def its_per_station_is_true(term: JonesTerm, at: Sampling) -> str:
         demand_same(j, j[:, :, first][:, :, group], "'frame' but stations of equal axes differ")
         demand_same(term.jones(at.one_per_frame()), j[:, :, first], "one station of each frame")
     return term.per_station
+
+
+def what_it_promises_to_be_real_is_real(term: JonesTerm, at: Sampling) -> str:
+    """`real` of an element beam: no imaginary part, so that the sign of time is the same to it."""
+    if not isinstance(term, ElementBeam) or not term.real:
+        return "not claimed"
+    found = max(float(np.abs(term.jones(where).imag).max()) for where in (at, hard_places(at)))
+    demand(found == 0, f"'real' but its imaginary part is {found:.1e}")
+    return "real"
 
 
 def a_term_that_is_not_directional_has_one_direction(term: JonesTerm, at: Sampling) -> str:
@@ -160,6 +169,7 @@ CLAIMS = (
     a_block_equals_the_slice_of_the_whole,
     its_structure_is_true,
     its_per_station_is_true,
+    what_it_promises_to_be_real_is_real,
     a_term_that_is_not_directional_has_one_direction,
     blindness_below_the_horizon_is_exact,
     it_is_finite_at_zenith_horizon_nadir_and_pole,

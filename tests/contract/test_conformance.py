@@ -47,10 +47,11 @@ SETTINGS: dict[tuple[str, ...], list[dict[str, Any]]] = {
         {},
         {"tiles": "ideal", "reference_frequency": 150 * u.MHz},
         {"beam": "array-factor"},
+        {"beam": "element", "phase": "everybeam"},
         {"beam": "element", "gain": GainTerm(rms=0.1), "feed": FeedTerm(rms=0.1)},
         {"beam": None, "gain": GainTerm(rms=0.1)},
     ],
-    ("telescopes", "lofar-lba"): [{}, {"antennas": "inner"}],
+    ("telescopes", "lofar-lba"): [{}, {"antennas": "inner", "phase": "everybeam"}],
     ("foregrounds", "gmca"): [{}, {"paper": True, "stokes": "Q"}],
     ("foregrounds", "gmca", "long"): [{"mode": "threshold"}, {"noise": "white"}],
     ("foregrounds", "pca"): [{}, {"components": 0}, {"stokes": "V"}],
@@ -224,6 +225,13 @@ class SaysShared(Fine):
     per_station: ClassVar[Any] = "shared"
 
 
+class SaysReal(Fine):
+    real: ClassVar[bool] = True
+
+    def jones(self, at):
+        return super().jones(at) * (1 + 1e-9j)
+
+
 class SaysOneDirection(Fine):
     directional: ClassVar[bool] = False
 
@@ -316,6 +324,7 @@ BROKEN_TERMS = [
     (NearlyDiagonal(), "its structure is true"),
     (CountsStations(), "its per station is true"),
     (SaysShared(), "its per station is true"),
+    (SaysReal(), "what it promises to be real is real"),
     (SaysOneDirection(), "a term that is not directional has one direction"),
     (SeesTheGround(), "blindness below the horizon is exact"),
     (NanAtTheZenith(), "it is finite at zenith horizon nadir and pole"),

@@ -12,6 +12,7 @@ from instrument import (
     Analyzer,
     Chain,
     Composed,
+    ElementBeam,
     FeedTerm,
     GainTerm,
     Imager,
@@ -24,6 +25,7 @@ from instrument import (
     Psf,
     Sampling,
     Scene,
+    StationBeam,
     StokesCube,
     Towards,
     mat2,
@@ -242,12 +244,47 @@ def test_corrected_data_are_what_is_seen_through_the_differential_beam(lofar):
         found - vis
 
 
-def test_array_factors_are_1_at_the_pointing_and_have_positive_phase_towards_their_parts():
+def test_array_factors_are_1_at_the_pointing_and_have_the_phase_of_the_fringe():
     offsets = pair(east=1.0).positions_m[:1] - pair(east=1.0).positions_m[1:]  # 1 m to the east
-    term = ArrayFactor(levels=(Level(offsets_m=offsets[None]),))
-    centre, east = (term.scalar(sampling(at(where), pair(east=100)))[0, 0, 0, 0] for where in ((0, 0), (1, 0)))
+    one, other = (ArrayFactor(levels=(Level(offsets_m=offsets[None]),), phase=p) for p in ("fringe", "everybeam"))
+    centre, east = (one.scalar(sampling(at(where), pair(east=100)))[0, 0, 0, 0] for where in ((0, 0), (1, 0)))
     assert centre == pytest.approx(1)
-    assert np.angle(east) == pytest.approx(2 * np.pi / LAMBDA * np.sin(np.deg2rad(1)), 1e-3)
+    assert np.angle(east) == pytest.approx(-2 * np.pi / LAMBDA * np.sin(np.deg2rad(1)), 1e-3)
+    seen = observe(at((1, 0)), pair(east=1.0)).data[0, 0, 0, 0, 0]
+    assert np.angle(east) == pytest.approx(np.angle(seen), 2e-4)  # 1e-4: differential aberration
+    assert other.scalar(sampling(at((1, 0)), pair(east=100)))[0, 0, 0, 0] == east.conj()
+
+
+class Turned(ElementBeam):
+    """exp(+i chi) for both receptors."""
+
+    chi: float = 0.3
+
+    def jones(self, at):
+        return np.exp(1j * self.chi) * (at.zenith_angle < np.pi / 2)[:, None, ..., None, None] * mat2.IDENTITY
+
+
+def test_elements_are_given_for_exp_plus_i_omega_t_and_multiplied_as_the_conjugate():
+    where = sampling(at((1, 0)), pair(east=100))
+    station, theirs = (StationBeam(element=Turned(), levels=(), phase=p) for p in ("fringe", "everybeam"))
+    for term, sign in ((Turned(), -1), (station, -1), (theirs, 1)):
+        found = [Chain(term).jones(where), Chain(term).factors(where).shared]
+        np.testing.assert_allclose([np.angle(x[0, 0, 0, 0, 0, 0]) for x in found], sign * 0.3, rtol=1e-12)
+    assert Chain(*Chain(Turned()).parts).jones(where)[0, 0, 0, 0, 0, 0] == pytest.approx(np.exp(-0.3j))  # once only
+
+
+def test_a_wave_that_is_right_handed_to_the_iau_has_negative_v():
+    """Fields exp(-i omega t), as the fringe has them, correlated: Ex = cos(omega t), Ey = sin(omega t)."""
+    turns = np.arange(64) / 64  # of the wave, at the second antenna
+    early = 10.0 * np.sin(np.deg2rad(1)) / LAMBDA  # the first is 10 m nearer the source, 1 deg away
+    positive = np.array([[[1.0], [1j]]])  # of exp(-i omega t): Re(i exp(-i x)) = sin x
+    north, east = np.moveaxis((positive * np.exp(-2j * np.pi * turns)).real, 1, 0)
+    angle = np.unwrap(2 * np.arctan2(east[0], north[0])) / 2
+    assert np.all(np.diff(angle) > 0)
+    first, second = (positive[0] * np.exp(-2j * np.pi * (turns + e)) for e in (early, 0.0))
+    seen = np.einsum("pt,qt->pq", first, second.conj()) / len(turns)
+    vis = observe(at((1, 0), (1.0, 0.0, 0.0, -1.0)), pair(east=10.0))
+    np.testing.assert_allclose(seen, vis.data[0, 0, 0], rtol=0, atol=3e-3)
 
 
 # images and noise

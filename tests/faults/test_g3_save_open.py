@@ -1,5 +1,6 @@
 """G3: visibilities to disk and back, block by block; other files are refused in one line."""
 
+import json
 import re
 import subprocess
 import sys
@@ -289,6 +290,36 @@ def test_a_beam_of_terms_that_are_not_known_here_is_said(vis, tmp_path):
     )
     with pytest.warns(ins.InstrumentWarning, match="which beam is in the data is not known here.*StrangersBeam"):
         assert ins.Visibilities.open(path).beam_state.beams is None
+
+
+@pytest.mark.parametrize("beam", ["full", "array-factor", "element"])
+def test_data_of_before_there_was_a_phase_hold_the_beam_of_everybeam(tmp_path, beam):
+    """Version 1 of the format: no `phase`, and elements by themselves multiplied as their makers give them."""
+    stations = ["CS001LBA", "CS302LBA", "RS508LBA"]
+    now, before = (
+        ins.load("telescopes", "lofar-lba", stations=stations, beam=beam, phase=phase)
+        for phase in ("fringe", "everybeam")
+    )
+    path = tmp_path / "v.h5"
+    night = ins.Observation(
+        phase_centre="08h13m36.0s +48d13m03s", start="2012-12-07T22:00:00", duration=20 * u.s, interval=10 * u.s,
+        frequencies=[60] * u.MHz,
+    )  # fmt: skip
+    sky = ins.PointSky.at(night.phase_centre.skycoord, [[1.0, 0, 0, 0]])
+    ins.Scene(instrument=before, sky=sky, observation=night).plan().run().save(path)
+    assert ins.Visibilities.open(path).beam_state.beams == before.chain().beams()
+    terms = now.chain().to_dict() if beam == "element" else before.chain().to_dict()
+    for term in terms["terms"]:
+        term.pop("phase", None)
+    told = {"removed": "nothing", "towards": None, "beams": {**terms, "terms": terms["terms"][2:]}, "other": False}
+    spoil(path, "beam_state", lambda x: np.frombuffer(json.dumps(told).encode(), np.uint8))
+    with h5py.File(path, "r+") as file:
+        file.attrs["version"] = 1
+    old = ins.Visibilities.open(path)
+    assert old.beam_state.beams == before.chain().beams() != now.chain().beams()
+    with pytest.raises(BeamStateError, match="is not the beam in the data"):
+        old.without_beam(now)
+    assert old.without_beam(before).beam_state.removed == "centre"
 
 
 FULL = """

@@ -19,8 +19,8 @@ VALUES = [
 KEYS = """
 seed tolerance engine name title instrument instrument.telescope instrument.stations instrument.element
 instrument.gain instrument.gain.rms instrument.gain.seed instrument.feed.rms instrument.beam instrument.tiles
-instrument.tile_pointing instrument.beam_pointing instrument.reference_frequency observation
-observation.phase_centre observation.start observation.transit observation.duration observation.interval
+instrument.tile_pointing instrument.beam_pointing instrument.reference_frequency instrument.phase
+observation observation.phase_centre observation.start observation.transit observation.duration observation.interval
 observation.frequency observation.frequency.centre observation.frequency.width observation.frequency.channels
 observation.frequencies observation.channel_width sky sky.kind sky.count sky.radius sky.flux_min sky.flux_max
 sky.slope sky.polarization sky.circular sky.spectral_index sky.scatter sky.frequency sky.seed sky.path noise.sefd
