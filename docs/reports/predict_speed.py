@@ -24,7 +24,8 @@ OURS = """
 import sys, numpy as np
 from instrument.pipeline.scene_file import parse
 from instrument.pipeline.scene_text import override, read_tables
-plan = parse(override(read_tables("mock-grid"), [f"observation.duration={sys.argv[1]}"])).scene().plan()
+asked = [f"observation.duration={sys.argv[1]}", "instrument.phase=everybeam"]
+plan = parse(override(read_tables("mock-grid"), asked)).scene().plan()
 np.save(sys.argv[2], plan.run().data)
 """
 

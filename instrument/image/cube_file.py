@@ -47,7 +47,7 @@ def write_cube(cube: _Cube, path: str | os.PathLike[str], overwrite: bool = Fals
         header["CTYPE4"], header["CRVAL4"], header["CDELT4"] = "FREQ-TAB", 1.0, 1.0
         header["PS4_0"], header["PS4_1"] = (TABLE, "table of the frequencies"), "FREQ"
     header["BUNIT"] = cube.unit
-    header["POLCCONV"] = ("IAU", "U and V: x north, y east, V right-handed")
+    header["POLCCONV"] = ("IAU", "x north, y east; V is minus that of the IAU")
     header["ORIGIN"] = "instrument"
     header.extend(fits_cards(), update=True)
     if cube.centre is None:

@@ -1,7 +1,8 @@
 """Visibilities against DP3's `predict` step, without and with the LOFAR beam.
 
 DP3 has V_ab = sum_s E_a B E_b^H exp(+2 pi i f/c (u l + v m + w (n-1))) with the UVW of Measurement Sets, position of
-ANTENNA2 minus ANTENNA1: the same numbers as ours. It stores complex64. Errors are rms relative to the rms.
+ANTENNA2 minus ANTENNA1: the same numbers as ours. E are those of EveryBeam, of the other sign of time: our
+`phase="everybeam"`. It stores complex64. Errors are rms relative to the rms.
 """
 
 import importlib.util
@@ -48,11 +49,8 @@ def sky(night):
     return PointSky(names=tuple(f"s{i}" for i in range(50)), ra_rad=ra, dec_rad=dec, stokes_jy=stokes)
 
 
-@pytest.fixture(scope="module")
-def dp3(make_ms, peer_environment, night, sky, tmp_path_factory):
-    """Function that lets DP3 predict the sky, with or without beam, (T, F, B, 2, 2)."""
-    folder = tmp_path_factory.mktemp("dp3")
-    make_ms(folder / "night.MS", instrument.load("telescopes", "lofar-hba"), night)
+def sky_file(folder, sky):
+    """The sources as text for DP3."""
     lines = ["FORMAT = Name, Type, Patch, Ra, Dec, I, Q, U, V"]
     places = np.rad2deg(sky.directions()).T
     for name, (ra, dec), stokes in zip(sky.names, places, sky.stokes_jy, strict=True):
@@ -60,25 +58,41 @@ def dp3(make_ms, peer_environment, night, sky, tmp_path_factory):
         # a patch for each source: DP3 shares one beam among the sources of a patch within an arcmin
         lines += [f", , {name}, {where}", f"{name}, POINT, {name}, {where}, " + ", ".join(f"{x:.17g}" for x in stokes)]
     (folder / "sky.txt").write_text("\n".join(lines) + "\n")
+    return folder / "sky.txt"
 
-    def predict(beam, sky_file=folder / "sky.txt"):
-        settings = {
-            "msin": folder / "night.MS",
-            "msout": ".",
-            "msout.datacolumn": "PREDICTED",
-            "steps": "[predict]",
-            "predict.sourcedb": sky_file,
-            "predict.usebeammodel": str(beam).lower(),
-            "predict.elementmodel": "hamaker",
-            "numthreads": 2,
-        }
-        # a process of its own: DP3 waits for ever for tables that are open in this one
-        command = [sys.executable, "-c", PREDICT, *(f"{k}={v}" for k, v in settings.items())]
-        done = subprocess.run(command, env=peer_environment, cwd=folder, capture_output=True, text=True, timeout=300)
-        assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
-        with tables.table(str(folder / "night.MS"), ack=False) as ms:
-            found = ms.getcol("PREDICTED")
-        return found.reshape(night.count, -1, len(night.freq_hz), 2, 2).swapaxes(1, 2)
+
+def predicted(data_set, sky, beam, environment, night):
+    """What DP3 predicts for a data set and a sky file, with or without beam, (T, F, B, 2, 2)."""
+    settings = {
+        "msin": data_set,
+        "msout": ".",
+        "msout.datacolumn": "PREDICTED",
+        "steps": "[predict]",
+        "predict.sourcedb": sky,
+        "predict.usebeammodel": str(beam).lower(),
+        "predict.elementmodel": "hamaker",
+        "numthreads": 2,
+    }
+    # a process of its own: DP3 waits for ever for tables that are open in this one
+    command = [sys.executable, "-c", PREDICT, *(f"{k}={v}" for k, v in settings.items())]
+    done = subprocess.run(
+        command, env=environment, cwd=data_set.parent, capture_output=True, text=True, timeout=300
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    with tables.table(str(data_set), ack=False) as ms:
+        found = ms.getcol("PREDICTED")
+    return found.reshape(night.count, -1, len(night.freq_hz), 2, 2).swapaxes(1, 2)
+
+
+@pytest.fixture(scope="module")
+def dp3(make_ms, peer_environment, night, sky, tmp_path_factory):
+    """Function that lets DP3 predict the sky for the 59 stations, with or without beam, (T, F, B, 2, 2)."""
+    folder = tmp_path_factory.mktemp("dp3")
+    make_ms(folder / "night.MS", instrument.load("telescopes", "lofar-hba"), night)
+    known = sky_file(folder, sky)
+
+    def predict(beam, sky_file=known):
+        return predicted(folder / "night.MS", sky_file, beam, peer_environment, night)
 
     return predict
 
@@ -97,8 +111,8 @@ def test_visibilities_without_beam_equal_dp3(dp3, night, sky):
 
 
 def test_visibilities_with_beam_equal_dp3(dp3, night, sky, casacore_itrf, with_everybeam_north):
-    scene = Scene(instrument=instrument.load("telescopes", "lofar-hba"), sky=sky, observation=night)
-    plan = scene.plan(engine="matrix")
+    lofar = instrument.load("telescopes", "lofar-hba", phase="everybeam")
+    plan = Scene(instrument=lofar, sky=sky, observation=night).plan(engine="matrix")
     theirs = dp3(beam=True)
     # measured 2.1e-5: DP3 sees sources and beam former from two wrong positions on Earth, 0.1 arcsec apart
     worst = error(plan.run().data, theirs, "beam")
@@ -111,6 +125,32 @@ def test_visibilities_with_beam_equal_dp3(dp3, night, sky, casacore_itrf, with_e
     # measured 1.1e-7, DP3 works in float32 here
     worst = error(plan.engine.sums(replace(plan.problem, at=at)), theirs, "beam, in the frames of DP3")
     assert worst < 3e-7
+
+
+def test_low_band_stations_equal_dp3_whichever_way_its_uvw_run(make_ms, peer_environment, night, sky, tmp_path):
+    """DP3's beams are of exp(+i omega t) always, its fringes only where UVW is position 1 minus position 2."""
+    names = ["CS001LBA", "CS302LBA", "RS106LBA", "RS406LBA", "RS508LBA"]
+    low = night.with_fields(frequencies=[45, 60] * u.MHz)
+    theirs, ours = (
+        instrument.load("telescopes", "lofar-lba", stations=names, phase=phase) for phase in ("everybeam", "fringe")
+    )
+    mirrored = sky.with_fields(stokes_jy=sky.stokes_jy * [1, 1, 1, -1])
+    one, other, wrong = (
+        Scene(instrument=lofar, sky=of, observation=low).plan(engine="matrix").run().data
+        for lofar, of in ((theirs, sky), (ours, mirrored), (ours, sky))
+    )
+    text = sky_file(tmp_path, sky)
+    make_ms(tmp_path / "lofar.MS", theirs, low)
+    make_ms(tmp_path / "turned.MS", ours, low)
+    with tables.table(str(tmp_path / "turned.MS"), readonly=False, ack=False) as ms:
+        ms.putcol("UVW", -ms.getcol("UVW"))
+    found, turned = (predicted(tmp_path / f"{k}.MS", text, True, peer_environment, low) for k in ("lofar", "turned"))
+    assert error(one, found, "UVW of LOFAR, everybeam") < 3e-5
+    assert error(other.conj(), turned, "UVW turned, conjugate of fringe, V turned") < 3e-5
+    # the test can fail
+    assert error(wrong, found, "UVW of LOFAR, fringe") > 1e-2
+    assert error(wrong.conj(), turned, "UVW turned, V not turned") > 1e-2
+    assert error(one.conj(), turned, "UVW turned, conjugate of everybeam") > 1e-2
 
 
 FILE = """FORMAT = Name, Type, Ra, Dec, I, Q, U, V, ReferenceFrequency='150e6', SpectralIndex='[]', LogarithmicSI, \

@@ -46,7 +46,7 @@ def write_faraday(cube: FaradaySpectra, path: str | os.PathLike[str], overwrite:
         head[f"CTYPE{i}"], head[f"CUNIT{i}"], head[f"CRVAL{i}"] = kind, unit, value
         head[f"CDELT{i}"], head[f"CRPIX{i}"] = delta, 1.0
     head["BUNIT"] = (cube.unit, "per RMSF")
-    head["POLCCONV"] = ("IAU", "U and V: x north, y east, V right-handed")
+    head["POLCCONV"] = ("IAU", "x north, y east; V is minus that of the IAU")
     head["STOKESIN"] = (cube.stokes, "what was transformed; P is Q + iU")
     head["LAMSQ0"] = (cube.lambda2_0, "lambda^2_0, m2")
     if np.isfinite(cube.fwhm):
