@@ -91,6 +91,8 @@ def test_i6_the_price_is_that_of_the_machine(monkeypatch):
         (["calibrate={kind='selfcal',interval='-5 s'}"], ("[calibrate]", "interval")),
         (["calibrate={kind='incomplete-model',models=[-1]}"], ("[calibrate]", "models")),
         (["instrument.reference_frequency='-1 MHz'"], ("[instrument]", "reference_frequency")),
+        (["instrument.phase='everybem'"], ("[instrument]", "phase = 'everybem'", "did you mean 'everybeam'?")),
+        (["instrument.phase=1"], ("[instrument]", "phase = 1", "'fringe', 'everybeam'")),
         (["sky.count=true"], ("[sky]", "count = True")),
         (["sky.count=2.5"], ("[sky]", "count = 2.5")),
         (["sky.seed=-1"], ("[sky]", "seed = -1")),

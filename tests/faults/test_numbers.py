@@ -133,6 +133,7 @@ def test_i2_scenes_written_with_module_paths_still_load_and_are_written_by_publi
     assert Component.from_json(scene.to_json()) == scene
     if name == "scene_lofar":
         assert scene.to_dict()["instrument"]["kind"] == "lofar-hba"
+        assert scene.to_dict()["instrument"]["phase"] == "fringe"  # a scene that does not say
         assert scene.to_dict()["instrument"]["element"] == {"kind": "dipole", "height": "0.5 m", "x_azimuth": "0.0 rad"}
 
 
