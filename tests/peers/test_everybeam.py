@@ -109,8 +109,8 @@ def test_station_jones_equal_everybeam_where_the_itrf_vectors_are_given(case, wi
     ours = case.lofar.with_fields(phase="fringe").chain().jones(at)
     worst = error(ours.conj(), theirs, f"the sign of the fringe, conjugated, {where.__name__}")
     assert worst < 1e-8  # as above
-    # the test can fail: unconjugated it is another beam, measured .26 (LBA) and 1.4e-4 (HBA) of the peak in the field
-    assert error(ours, theirs, "not conjugated") > 1e-5
+    # the test can fail: measured .044 of the peak in the field (HBA, 115 to 230 MHz) and .46 (LBA, 15 to 80 MHz)
+    assert error(ours, theirs, "not conjugated") > 1e-2
 
 
 def test_beam_former_with_one_frequency_for_the_band_equals_everybeam(case, with_everybeam_north):
