@@ -9,6 +9,7 @@ from instrument.pipeline.stage import EachBlock, Running, Stage, StageRun
 from instrument.pipeline.work import StageWork, copies
 from instrument.scene import Scene
 
+BLOCK = 8e-3  # seconds of a block, for where the phase centre stands and the beam there
 
 class Correct(Stage):
     """Takes effects out of the visibilities: `beam = "centre"` the beam towards the phase centre."""
@@ -29,7 +30,8 @@ class Correct(Stage):
         """Matrices of the stations on both sides of every visibility."""
         if not run.instrument.chain().beams().parts:
             return StageWork("no beam to take out")
-        return copies(run.visibilities, run.block, 3.0, 0.4e-6, "the beam towards the phase centre taken out")
+        work = copies(run.visibilities, run.block, 3.0, 0.4e-6, "the beam towards the phase centre taken out")
+        return work._replace(seconds=work.seconds + BLOCK * len(run.plan.slices))
 
     def start(self, run: Running) -> StageRun:
         """The stage at work."""
