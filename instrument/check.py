@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from instrument import mat2
+from instrument.correlations import alike
 from instrument.errors import InputError
 from instrument.numbers import COUNT, SEED
 from instrument.observe.closure import CLOSURE_M
@@ -149,9 +150,9 @@ class Checker:
 
     def _compare(self, full: Problem, t: int, f: int, block: Visibilities, i: int, j: int) -> None:
         cell = full.block(slice(t, t + 1), slice(f, f + 1)).between(block.antenna1, block.antenna2)
-        found = np.abs(block.data[i, j] - definition(cell)).max(axis=(-2, -1))
-        flag = np.broadcast_to(block.flag, block.data.shape[:3])[i, j]
-        used = np.flatnonzero(~flag)
+        known = np.broadcast_to(~alike(block.data, block.flag)[1], block.data.shape)[i, j]
+        found = np.where(known, np.abs(block.data[i, j] - definition(cell)), 0.0).max(axis=(-2, -1))
+        used = np.flatnonzero(known.any(axis=(-2, -1)))
         if not used.size:
             return
         pick = int(used[np.argmax(np.where(np.isnan(found[used]), np.inf, found[used]))])  # NaN is the worst of all

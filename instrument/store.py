@@ -62,6 +62,8 @@ def _fixed(block: Any, texts: bool = True) -> dict[str, Any]:
     state, at = block.beam_state, block.at
     out = {name: getattr(block, name) for name in FIXED[:2]} | {name: getattr(at, name) for name in FIXED[2:4]}
     out["centre"] = np.array(at.centre)
+    if at.steered is not None:
+        out["steered"] = np.array(at.steered)
     if not texts:
         return out
     beams = None if state.beams is None else state.beams.to_dict()
@@ -103,8 +105,9 @@ class StoreWriter:
         """Write a block."""
         # a chain takes 20 ms to be spelled out: not again where it is the same object
         seen = block.layout is self.known[0] and block.beam_state is self.known[1]
-        for name, value in _fixed(block, texts=not seen).items():
-            if not np.array_equal(value, self.fixed[name]):
+        fixed = _fixed(block, texts=not seen)
+        for name in dict.fromkeys((*fixed, *(k for k in self.fixed if k not in FIXED[-2:]))):
+            if not np.array_equal(fixed.get(name), self.fixed.get(name)):
                 error = BeamStateError if name == "beam_state" else InputError
                 raise error(f"the blocks differ in {name}: save each kind in a file of its own")
         t, f = _rows(self.slots, block.at.slots_s, "times"), _rows(self.channels, block.freq_hz, "channels")
@@ -123,8 +126,10 @@ class StoreWriter:
         shape = (len(self.slots), len(self.channels), len(block.antenna1))
         for name, axes in SPREAD.items():
             here = tuple((t, f)[axis] for axis in axes)
-            size = shape if len(axes) == 2 else tuple(shape[axis] for axis in axes)
-            self.spread[name].put(getattr(block, name), here, size)
+            array = getattr(block, name)
+            # weights and flags may be of correlations: two more axes
+            size = (*shape, *array.shape[3:]) if len(axes) == 2 else tuple(shape[axis] for axis in axes)
+            self.spread[name].put(array, here, size)
         self.created.check()
 
     def _put(self, name: str, where: tuple[slice, ...], array: Any) -> None:
@@ -172,6 +177,10 @@ class _Spread:
         if array is None or not self.begun:
             self.kept, self.where, self.begun = array, where, True
             return
+        if array.ndim != self.kept.ndim:
+            raise InputError(
+                f"some blocks have {self.name} for each correlation and others have not: give all the same"
+            )
         if self.name not in self.file:
             constant = all(n == 1 for n in self.kept.shape[: len(where)])
             if constant and np.array_equal(array, self.kept):
@@ -210,6 +219,7 @@ class Store:
         texts = {name: small[name].astype(np.uint8).tobytes().decode("utf-8", "replace") for name in FIXED[-2:]}
         self.slots_s, self.freq_hz = small["slots_s"], small["freq_hz"]
         numbers = (self.slots_s, self.freq_hz, small["centre"], small["earth_matrices"], small["earth_velocity"])
+        numbers = (*numbers, small.get("steered", np.zeros(2)))
         if not all(np.isfinite(x).all() for x in numbers) or (self.freq_hz <= 0).any():
             raise FileError(f"{self.name}: times, frequencies or coordinates are not finite, or not above 0")
         try:
@@ -228,7 +238,7 @@ class Store:
             raise FileError(f"{self.name}: version {version} of the format is not one of {KNOWN}: take a newer program")
         there = h5.members(file)
         needed = ("data", "freq_hz", *PER_TIME[:3], *FIXED, "weight", "flag", "interval_s")
-        known = [n for n in ("data", "freq_hz", *PER_TIME, *FIXED, *SPREAD) if n in needed or n in there]
+        known = [n for n in ("data", "freq_hz", *PER_TIME, *FIXED, "steered", *SPREAD) if n in needed or n in there]
         sets = {name: h5.dataset(file, name, KINDS.get(name, "f")) for name in known}
         t, f, b = (*sets["data"].shape, 0, 0, 0)[:3]
         s = sets["ra_rad"].size
@@ -236,15 +246,17 @@ class Store:
             "data": (t, f, b, 2, 2), "freq_hz": (f,), "slots_s": (t,), "earth_matrices": (t, 3, 3),
             "earth_velocity": (t, 3), "seen": (t, s, 3), "seen_east": (t, s, 3), "seen_centre": (t, 3),
             "given_uvw_m": (t, b, 3), "antenna1": (b,), "antenna2": (b,), "ra_rad": (s,), "dec_rad": (s,),
-            "centre": (2,),
+            "centre": (2,), "steered": (2,),
         }  # fmt: skip
         for name, shape in due.items():
             if name in sets and (sets[name].shape != shape or 0 in shape):
                 raise FileError(f"{self.name}: '{name}' has shape {sets[name].shape}, needed {shape}, none of them 0")
-        whole = (t, f, b)
+        whole = (t, f, b, 2, 2)
         for name, axes in SPREAD.items():
-            shape = whole if len(axes) == 2 else tuple(whole[axis] for axis in axes)
-            given = sets[name].shape if name in sets else shape
+            if name not in sets:
+                continue
+            given = sets[name].shape
+            shape = tuple(whole[axis] for axis in axes) if len(axes) == 1 else whole[: 5 if len(given) == 5 else 3]
             if len(given) != len(shape) or any(n not in (1, m) for n, m in zip(given, shape, strict=True)):
                 raise FileError(f"{self.name}: '{name}' has shape {given}, needed {shape} with length 1 where constant")
         h5.demand_affordable(list(sets.values()))
@@ -255,7 +267,7 @@ class Store:
         t, f = (
             _forward(s, n, w) for s, n, w in zip((times, channels), self.shape, ("times", "channels"), strict=False)
         )
-        size = 80.0 * reduce(mul, (len(range(*s.indices(n))) for s, n in zip((t, f), self.shape, strict=False)), 1)
+        size = 100.0 * reduce(mul, (len(range(*s.indices(n))) for s, n in zip((t, f), self.shape, strict=False)), 1)
         afford(
             size * self.shape[2], f"{self.name}: what is asked for", "choose times= or channels=, or take its blocks"
         )
@@ -269,6 +281,8 @@ class Store:
                     out[name] = sets[name][tuple(slice(None) if n == 1 else step for n, step in steps)]
             late = {name: sets[name][t] for name in PER_TIME[3:] if name in sets}
         out["given_uvw_m"] = late.pop("given_uvw_m", None)
+        if "steered" in self.small:
+            late["steered"] = Direction(*self.small["steered"].tolist())
         small, earth = self.small, EarthFrame(self.small["earth_matrices"][t], self.small["earth_velocity"][t])
         out["at"] = Sampling(
             self.layout, earth, self.slots_s[t], self.freq_hz[f], small["ra_rad"], small["dec_rad"],

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from instrument import mat2, store
+from instrument import correlations, store
+from instrument.averaging import averaged
 from instrument.beam_state import BeamState as BeamState
 from instrument.checked import checked
 from instrument.errors import BeamStateError, FileError, InputError
@@ -21,14 +22,15 @@ from instrument.jones.chain import Chain
 from instrument.jones.gain import exact_key, slot_normals
 from instrument.jones.towards import Towards, towards_in
 from instrument.model import Instrument
-from instrument.numbers import LARGEST
 from instrument.observe.closure import stations_of
 from instrument.observe.layout import Layout
-from instrument.observe.sampling import Sampling
-from instrument.units import SEED, Bool, Complex, Direction, Float, Int, one_si, plain
-from instrument.visibility_checks import check_baselines, check_weights, positive_along
+from instrument.observe.sampling import Sampling, times_of
+from instrument.recentred import recentred
+from instrument.station_jones import inverted, station_jones, through
+from instrument.units import SEED, Bool, Complex, Count, Direction, Float, Int, direction, one_si, plain
+from instrument.visibility_checks import as_kind, check_baselines, check_weights, positive_along, same_coordinates
 
-CANCELS = 1e6  # of a Jones matrix: its inverse twice in double precision leaves 1e-4
+KINDS = {"data": complex, "weight": float, "antenna1": int, "antenna2": int, "given_uvw_m": float}
 
 
 @checked
@@ -67,7 +69,8 @@ class Visibilities(VisibilitySet):
     """Visibilities in Jy, complex (T, F, B, 2, 2): rows are receptors p, q of the first station, columns of the second.
 
     `at` holds times, channels, stations and the phase centre; `weight` (finite, not negative) and `flag` (bool) are
-    (T, F, B), length 1 where constant. `interval_s` (T,) and `width_hz` (F,) are one number where all are alike.
+    (T, F, B), or (T, F, B, 2, 2) for each correlation, length 1 where constant. `interval_s` (T,) and `width_hz` (F,)
+    are one number where all are alike.
     `given_uvw_m` (T, B, 3), m, station 1 minus station 2, are the UVW of a file; without it they are worked out.
     Nothing is changed in place: every method returns a new object.
     """
@@ -84,7 +87,10 @@ class Visibilities(VisibilitySet):
     given_uvw_m: Float | None = None
 
     def __post_init__(self) -> None:
-        self._as_the_kernels_take_them()
+        for name, kind in KINDS.items():
+            object.__setattr__(self, name, as_kind(getattr(self, name), kind))
+        for name in ("weight", "flag"):
+            object.__setattr__(self, name, correlations.plain_axes(getattr(self, name)))
         times, channels, _, _ = self.at.shape
         want = (times, channels, len(self.antenna1), 2, 2)
         if self.data.shape != want:
@@ -93,19 +99,9 @@ class Visibilities(VisibilitySet):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, positive_along(getattr(self, name), count, name))
         check_baselines(self.antenna1, self.antenna2, self.layout.names)
-        check_weights(self.weight, self.flag, want[:3])
+        check_weights(self.weight, self.flag, want)
         if (uvw := self.given_uvw_m) is not None and (uvw.shape != (times, want[2], 3) or not np.isfinite(uvw).all()):
             raise InputError(f"given_uvw_m has shape {uvw.shape}, needed {(times, want[2], 3)}, all finite")
-
-    def _as_the_kernels_take_them(self) -> None:
-        """Numbers of any precision and byte order in double precision and the machine's own order."""
-        kinds = (("data", complex), ("weight", float), ("antenna1", int), ("antenna2", int), ("given_uvw_m", float))
-        for name, kind in kinds:
-            given = getattr(self, name)
-            if given is None or given.dtype == kind or given.dtype.kind not in "fiuc":
-                continue
-            if kind is not int or given.dtype.kind != "f":  # 1.5 is no number of a station
-                object.__setattr__(self, name, given.astype(kind))
 
     def __repr__(self) -> str:
         times, channels, baselines = self.data.shape[:3]
@@ -132,9 +128,7 @@ class Visibilities(VisibilitySet):
     @property
     def times(self) -> Any:
         """Centres of the integrations, UTC `Time` (T,)."""
-        from astropy.time import Time
-
-        return Time(self.at.slots_s // 86400, (self.at.slots_s % 86400) / 86400, format="mjd", scale="utc")
+        return times_of(self.at.slots_s)
 
     @property
     def integration_s(self) -> float:
@@ -200,22 +194,38 @@ class Visibilities(VisibilitySet):
 
     @property
     def effective_weight(self) -> Float:
-        """Weights with flagged and non-finite data at zero, (T, F, B)."""
-        good = (
-            ~self.flag & np.isfinite(self.data.real).all(axis=(-2, -1)) & np.isfinite(self.data.imag).all(axis=(-2, -1))
-        )
-        return np.where(good, self.weight, 0.0)
+        """Weights with flagged and non-finite data at zero, (T, F, B), or (T, F, B, 2, 2) where correlations differ.
+
+        With weights and flags of whole visibilities one correlation that is not finite spoils all four.
+        """
+        weight, flag = correlations.alike(self.weight, self.flag)
+        finite: Bool = np.isfinite(self.data)
+        good = finite if weight.ndim == correlations.APART else np.asarray(finite.all(axis=(-2, -1)))
+        return np.where(good & ~flag, weight, 0.0)
+
+    @property
+    def whole_weight(self) -> Float:
+        """One effective weight for each visibility, (T, F, B): the harmonic mean of the four, 0 where one is 0."""
+        return correlations.whole(self.effective_weight)
+
+    @property
+    def stokes_weight(self) -> Float:
+        """Effective weights of I, Q, U, V, (T, F, B, 4), or (T, F, B, 1) where one holds for all correlations.
+
+        The harmonic mean of the two correlations that it is made of, 0 where one is 0: a flagged pp takes I and Q.
+        """
+        return correlations.of_stokes(self.effective_weight)
 
     def with_data(self, data: Complex) -> Visibilities:
         """The same coordinates with other data, (T, F, B, 2, 2)."""
         return replace(self, data=data)
 
     def flagged(self, flag: Bool) -> Visibilities:
-        """The same with more flags, (T, F, B), length 1 where constant."""
-        return replace(self, flag=self.flag | flag)
+        """The same with more flags, (T, F, B) or (T, F, B, 2, 2), length 1 where constant."""
+        return replace(self, flag=correlations.either(self.flag, flag))
 
     def weighted(self, weight: Float) -> Visibilities:
-        """The same with other weights (T, F, B), length 1 where constant; negative and non-finite ones raise."""
+        """The same with other weights, (T, F, B) or (T, F, B, 2, 2), length 1 where constant; none below 0."""
         return replace(self, weight=plain(weight, float, "weight"))
 
     def stokes(self) -> Complex:
@@ -250,24 +260,29 @@ class Visibilities(VisibilitySet):
             noisy[:, i] += np.sqrt(2) * sigma[:, i, None, None, None] * drawn
         return replace(self, data=noisy)
 
+    def averaged(self, time: Any = None, channels: Count = 1) -> Visibilities:
+        """Weighted means over `time` (a whole number of integrations) and so many channels; weights add up.
+
+        At the mean time and frequency; what has no weight is flagged, and gaps are not filled. A source at phases that
+        turn by x cycles over an average loses 1 - sin(pi x) / (pi x) of its amplitude.
+        """
+        seconds = None if time is None else one_si(time, "s", "time", above=0)
+        return replace(self, **averaged(self, seconds, channels))
+
+    def shifted_to(self, centre: Any) -> Visibilities:
+        """The same about another phase centre (SkyCoord, text): phases, u, v and w turn; beams point where they did."""
+        return replace(self, **recentred(self, direction(centre, "centre")))
+
     def corrected(self, term: JonesTerm | Chain) -> Visibilities:
         """J_a^-1 V J_b^-H for a direction-independent term; zero and flagged where J or its square has no inverse.
 
         So also where the inverse cancels to a part in 1e6 or less: data would be wrong by 1e-4 of themselves and more.
         """
-        jones = self._station_jones(term)
-        inverse = mat2.inverse(jones)
-        largest = np.abs(inverse).max(axis=(-2, -1))  # the data are multiplied with two of them
-        # |J^-1| |J| (Skeel): rounding of the data grows with its square; 1 where receptors differ in scale alone
-        lost = mat2.mul(np.abs(inverse), np.abs(jones)).max(axis=(-2, -1)).real
-        good = np.asarray((largest > 1 / LARGEST) & (largest < LARGEST) & (lost < CANCELS))
-        inverse = np.where(good[..., None, None], inverse, 0.0)
-        data = mat2.sandwich(inverse[:, :, self._pick(inverse, 1)], self.data, inverse[:, :, self._pick(inverse, 2)])
-        flag = self.flag | ~(good[:, :, self._pick(inverse, 1)] & good[:, :, self._pick(inverse, 2)])
+        inverse, good = inverted(station_jones(term, self.at))
         state = self.beam_state
         for beam in towards_in(term):
             state = state.without(beam, self.phase_centre)
-        return replace(self, data=data, flag=flag, beam_state=state)
+        return replace(self, **through(self, inverse, good), beam_state=state)
 
     def without_beam(self, instrument: Instrument) -> Visibilities:
         """The same with the beam of an instrument towards the phase centre taken out, not its gains and feeds.
@@ -286,47 +301,26 @@ class Visibilities(VisibilitySet):
 
     def corrupted(self, term: JonesTerm | Chain) -> Visibilities:
         """J_a V J_b^H for a direction-independent term; inverse of `corrected`."""
-        jones = self._station_jones(term)
-        data = mat2.sandwich(jones[:, :, self._pick(jones, 1)], self.data, jones[:, :, self._pick(jones, 2)])
         state = self.beam_state
         for beam in towards_in(term):
             state = state.with_beam(beam)
-        return replace(self, data=data, beam_state=state)
+        return replace(self, **through(self, station_jones(term, self.at)), beam_state=state)
 
     def check_same(self, other: Visibilities) -> None:
         """Raise where the other set has other coordinates, or a beam state of its own (`BeamStateError`)."""
         if self.beam_state != other.beam_state:
             raise BeamStateError(f"cannot mix visibilities of {self.beam_state} and of {other.beam_state}")
-        same = (
-            self.data.shape == other.data.shape
-            and self.phase_centre == other.phase_centre
-            and self.layout.names == other.layout.names
-            and np.array_equal(self.layout.positions_m, other.layout.positions_m)
-            and np.array_equal(self.antenna1, other.antenna1)
-            and np.array_equal(self.antenna2, other.antenna2)
-            and np.array_equal(self.at.slots_s, other.at.slots_s)
-            and np.array_equal(self.freq_hz, other.freq_hz)
-            and (self.given_uvw_m is other.given_uvw_m or np.array_equal(self.uvw_m, other.uvw_m))
-        )
-        if not same:
-            raise InputError("visibilities of other times, channels, stations or phase centres cannot be subtracted")
+        if not same_coordinates(self, other):
+            raise InputError(
+                "visibilities of other times, channels, stations or phase centres cannot be added or subtracted"
+            )
 
     def __sub__(self, other: Visibilities) -> Visibilities:
         """Difference of two sets on the same coordinates; raises `BeamStateError` when their beam states differ."""
         self.check_same(other)
-        return replace(self, data=self.data - other.data, flag=self.flag | other.flag)
+        return replace(self, data=self.data - other.data, flag=correlations.either(self.flag, other.flag))
 
-    def _station_jones(self, term: JonesTerm | Chain) -> Complex:
-        found = term.jones(self.at)[:, :, :, :1]
-        spread = [t for t in (term.parts if isinstance(term, Chain) else term.parts()) if t.directional]
-        if spread:
-            raise InputError(
-                f"{spread[0].called} differs between directions: visibilities can be corrected towards one "
-                "direction only; use Towards(chain=...)"
-            )
-        return found[:, :, :, 0]
-
-    def _pick(self, jones: Complex, which: int) -> Any:
-        if jones.shape[2] == 1:
-            return slice(None)
-        return self.antenna1 if which == 1 else self.antenna2
+    def __add__(self, other: Visibilities) -> Visibilities:
+        """Sum of two sets on the same coordinates, with the weights of the first; `BeamStateError` as for `-`."""
+        self.check_same(other)
+        return replace(self, data=self.data + other.data, flag=correlations.either(self.flag, other.flag))

@@ -1,14 +1,37 @@
-"""What visibilities must be: baselines of two stations, each once; weights, flags, lengths of time and channel."""
+"""What visibilities must be: baselines of two stations, each once; weights, flags, lengths; the same coordinates."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from instrument.errors import InputError
 from instrument.numbers import LARGEST
 from instrument.units import Bool, Float, Int
+
+
+def same_coordinates(one: Any, other: Any) -> bool:
+    """Whether two sets of visibilities are of the same times, channels, stations, baselines and phase centre."""
+    return (
+        one.data.shape == other.data.shape
+        and one.phase_centre == other.phase_centre
+        and one.layout.names == other.layout.names
+        and np.array_equal(one.layout.positions_m, other.layout.positions_m)
+        and np.array_equal(one.antenna1, other.antenna1)
+        and np.array_equal(one.antenna2, other.antenna2)
+        and np.array_equal(one.at.slots_s, other.at.slots_s)
+        and np.array_equal(one.freq_hz, other.freq_hz)
+        and (one.given_uvw_m is other.given_uvw_m or np.array_equal(one.uvw_m, other.uvw_m))
+    )
+
+
+def as_kind(given: Any, kind: type) -> Any:
+    """Numbers of any precision and byte order in double precision and the order of this machine; else as given."""
+    if given is None or given.dtype == kind or given.dtype.kind not in "fiuc":
+        return given
+    return given if kind is int and given.dtype.kind == "f" else given.astype(kind)  # 1.5 is no number of a station
 
 
 def positive_along(given: Float | float, count: int, name: str) -> Float:
@@ -39,10 +62,13 @@ def check_baselines(first: Int, second: Int, names: Sequence[str]) -> None:
 
 
 def check_weights(weight: Float, flag: Bool, want: tuple[int, ...]) -> None:
-    """Raises `InputError` for shapes other than (T, F, B), length 1 where constant, and for wrong weights."""
+    """Raises `InputError` for shapes that are no part of (T, F, B) or (T, F, B, 2, 2), and for wrong weights."""
     for name, array in (("weight", weight), ("flag", flag)):
-        if array.ndim != 3 or any(n not in (1, m) for n, m in zip(array.shape, want, strict=True)):
-            raise InputError(f"{name} has shape {array.shape}, needed {want} with length 1 where constant")
+        if array.ndim not in (3, 5) or any(n not in (1, m) for n, m in zip(array.shape, want, strict=False)):
+            raise InputError(
+                f"{name} has shape {array.shape}, needed {want[:3]}, or {want} for each correlation, with length 1 "
+                "where constant"
+            )
     if flag.dtype.kind != "b":
         raise InputError(f"flag holds {flag.dtype}, needed bool")
     if weight.dtype.kind not in "fiu" or not np.all(np.isfinite(weight)) or np.any(weight < 0):

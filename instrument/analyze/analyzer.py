@@ -15,8 +15,9 @@ from instrument.analyze.power.signal import Signal21cm
 from instrument.analyze.power.spectra import Spectrum2D, spectrum_2d
 from instrument.analyze.power.transform import Transform, cells_of
 from instrument.analyze.power.window import EoRWindow, eor_window
+from instrument.analyze.sources.fluxes import SourceFluxes
 from instrument.analyze.sources.leakage import Leakage, leakage_of
-from instrument.analyze.sources.photometry import ForcedPhotometry, SourceFluxes
+from instrument.analyze.sources.photometry import ForcedPhotometry
 from instrument.checked import checked
 from instrument.errors import InputError
 from instrument.image.common_beam import say_unequal_beams

@@ -165,6 +165,7 @@ class Calibrator(Component):
 def pair(data: Visibilities, model: Visibilities) -> tuple[Complex, Complex, Float]:
     """Data and model (T, F, B, 2, 2) and weights (T, F, B) of a solve; flagged and non-finite data weigh nothing.
 
+    Weights of correlations are those of the visibility as a whole (`whole_weight`): it counts where all four are known.
     Raises when coordinates or beam states differ.
     """
     if data.data.shape != model.data.shape:
@@ -172,11 +173,8 @@ def pair(data: Visibilities, model: Visibilities) -> tuple[Complex, Complex, Flo
     for count, what in zip(data.data.shape, ("integrations", "channels", "baselines"), strict=False):
         if count == 0:
             raise InputError(f"the data have no {what}: there is nothing to solve for")
-    if not np.all(np.isfinite(data.weight)) or np.any(data.weight < 0):
-        bad = data.weight[~(np.isfinite(data.weight) & (data.weight >= 0))]
-        raise InputError(f"weight = {bad[0]} must be finite and not negative: flag what should not count")
     data.check_same(model)
-    weight = np.broadcast_to(data.effective_weight, data.data.shape[:3])
+    weight = np.broadcast_to(data.whole_weight, data.data.shape[:3])
     return data.data, model.data, weight
 
 

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from instrument import mat2
+from instrument import correlations, mat2
 from instrument.calibrate.again import Fits
 from instrument.calibrate.fit import strange
 from instrument.calibrate.gauge import UNKNOWNS, Gauge, common, free_counts
@@ -177,8 +177,9 @@ class Job:
         vis, used = self.visibilities, samples > 0
         if self.settings.pattern != "full":
             return False
-        flag = np.broadcast_to(vis.flag, vis.data.shape[:3])[cell] | ~np.isfinite(vis.data[cell]).all(axis=(-2, -1))
-        wanted = ~flag.all(axis=(0, 1)) & held[vis.antenna1] & held[vis.antenna2]
+        flag = np.broadcast_to(correlations.alike(vis.data, vis.flag)[1], vis.data.shape)[cell]
+        lost = flag | ~np.isfinite(vis.data[cell]).all(axis=(-2, -1), keepdims=True)
+        wanted = ~lost.all(axis=(0, 1, 3, 4)) & held[vis.antenna1] & held[vis.antenna2]
         if not np.any(wanted & ~used):
             return False
         every, alike = freedom(model, np.ones(len(model)), vis.antenna1, vis.antenna2, len(held))

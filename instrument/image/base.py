@@ -85,10 +85,21 @@ class AnyImager(Component):
         """
 
     def chosen(self, block: Visibilities, channel: int) -> tuple[Float, Float, Any]:
-        """Baselines in wavelengths (N, 3) within the uv range, their weights (N,), and which ones (T, B) they are."""
+        """Baselines in wavelengths (N, 3) within the uv range, their weights (N,), and which ones (T, B) they are.
+
+        One weight for each visibility, 0 where a correlation is not known; `chosen_stokes` has those of I, Q, U, V.
+        """
+        uvw, weight, use = self._within(block, channel, block.whole_weight[..., None])
+        return uvw, weight[:, 0], use
+
+    def chosen_stokes(self, block: Visibilities, channel: int) -> tuple[Float, Float, Any]:
+        """The same with weights of I, Q, U, V (N, 4), or (N, 1) where one holds for all; one above 0 at least."""
+        return self._within(block, channel, block.stokes_weight)
+
+    def _within(self, block: Visibilities, channel: int, weights: Float) -> tuple[Float, Float, Any]:
         uvw = block.uvw_m * (block.freq_hz[channel] / LIGHT)
-        weight = np.broadcast_to(block.effective_weight, block.data.shape[:3])[:, channel]
-        use = weight > 0
+        weight = np.broadcast_to(weights, (*block.data.shape[:3], weights.shape[-1]))[:, channel]
+        use = (weight > 0).any(axis=-1)
         if self.uv_range is not None:
             length = np.hypot(uvw[..., 0], uvw[..., 1])
             use = use & (length >= self.uv_range[0]) & (length <= self.uv_range[1])

@@ -31,7 +31,8 @@ class Imager(AnyImager):
     """Dirty images of `pixels` x `pixels` of `pixel` each, from baselines within `uv_range` (wavelengths).
 
     `weighting` "natural", "uniform" or "briggs" (with `robust`). The w-term is always there. `accuracy` is that of the
-    gridding, relative to the rms of the image. Flagged and non-finite visibilities have no weight.
+    gridding, relative to the rms of the image. Flagged and non-finite visibilities have no weight. Where correlations
+    have weights or flags of their own, so have I, Q, U and V (`stokes_weight`); the PSF is then that of Stokes I.
     """
 
     weighting: Weighting = "natural"
@@ -66,7 +67,7 @@ class Imager(AnyImager):
         found: dict[float, Density] = {}
         for block in visibilities.coverage():
             for f, freq in enumerate(block.freq_hz):
-                uvw, weight, _ = self.chosen(block, f)
+                uvw, weight, _ = self.chosen_stokes(block, f)
                 found.setdefault(float(freq), Density(self.pixels, self.pixel)).add(uvw[:, :2], weight)
         return found
 
@@ -87,7 +88,7 @@ class _Channel:
         self.freq_hz, self.pixels = freq_hz, pixels
         self.waiting: list[tuple[Float, Float, Complex]] = []
         self.count = 0
-        self.weight = 0.0
+        self.weight = np.zeros(4)  # of I, Q, U, V
 
     @cached_property
     def sums(self) -> Float:
@@ -113,14 +114,15 @@ class Images(ImageSums):
         stokes = None
         for f, freq in enumerate(block.freq_hz):
             channel = self.channels.setdefault(float(freq), _Channel(float(freq), self.imager.pixels))
-            uvw, weight, use = self.imager.chosen(block, f)
+            uvw, weight, use = self.imager.chosen_stokes(block, f)
             if not len(weight):
                 continue
             if self.density is not None:
                 factor = self.density[float(freq)].factor(uvw[:, :2], self.imager.weighting, self.imager.robust)
                 weight = weight * factor
             stokes = block.stokes() if stokes is None else stokes
-            channel.waiting.append((uvw, weight, stokes[:, f][use]))
+            # of no weight, the data may be NaN
+            channel.waiting.append((uvw, weight, np.where(weight > 0, stokes[:, f][use], 0.0)))
             channel.count += len(weight)
             self.waiting += len(weight)
             if channel.count >= HELD:
@@ -134,9 +136,12 @@ class Images(ImageSums):
             return
         from ducc0.wgridder.experimental import vis2dirty
 
-        uvw, weight, stokes = (np.concatenate(parts) for parts in zip(*channel.waiting, strict=True))
+        most = max(weight.shape[1] for _, weight, _ in channel.waiting)
+        waiting = ((uvw, np.broadcast_to(w, (len(w), most)), values) for uvw, w, values in channel.waiting)
+        uvw, weight, stokes = (np.concatenate(parts) for parts in zip(*waiting, strict=True))
         columns = [*np.moveaxis(stokes, -1, 0), np.ones(len(weight), complex)]
-        for image, values in zip(channel.sums, columns, strict=True):
+        weights = np.broadcast_to(weight, (len(weight), 4)).T[[0, 1, 2, 3, 0]]
+        for image, values, each in zip(channel.sums, columns, weights, strict=True):
             if not values.any():  # a Stokes parameter that is exactly zero
                 continue
             # ducc0 has exp(+2 pi i (u l + v m - w (n-1))) for the adjoint: flip w; x to the west: flip u
@@ -144,7 +149,7 @@ class Images(ImageSums):
                 uvw=uvw * (LIGHT / channel.freq_hz),
                 freq=np.array([channel.freq_hz]),
                 vis=np.ascontiguousarray(values)[:, None],
-                wgt=weight[:, None],
+                wgt=np.ascontiguousarray(each)[:, None],
                 npix_x=self.imager.pixels,
                 npix_y=self.imager.pixels,
                 pixsize_x=self.imager.pixel,
@@ -156,7 +161,7 @@ class Images(ImageSums):
                 flip_w=True,
                 nthreads=0,
             ).T
-        channel.weight += float(weight.sum())
+        channel.weight += weight.sum(axis=0)
         self.waiting -= channel.count
         channel.waiting, channel.count = [], 0
 
@@ -173,10 +178,10 @@ class Images(ImageSums):
             channel = self.channels[freq]
             self._grid(channel)
             with np.errstate(divide="ignore", invalid="ignore"):
-                np.divide(channel.sums[:4], channel.weight, out=planes[f])
-                np.divide(channel.sums[4], channel.weight, out=psfs[f])
+                np.divide(channel.sums[:4], channel.weight[:, None, None], out=planes[f])
+                np.divide(channel.sums[4], channel.weight[0], out=psfs[f])
             del channel.sums  # a sum and its image at once: twice the cube for one channel only
-        if not any(self.channels[f].weight for f in freqs):
+        if not any(self.channels[f].weight.any() for f in freqs):
             raise RefusedError(f"no visibility lies within uv_range = {self.imager.uv_range} with a weight above 0")
         return StokesCube(
             data=planes,

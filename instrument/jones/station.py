@@ -68,7 +68,7 @@ class ArrayFactor(ScalarTerm):
         times, channels, _, sources = at.shape
         light = -LIGHT if self.phase == "fringe" else LIGHT
         for level in self.levels:
-            steer = at.centre_itrf if level.pointing is None else at.earth.itrf(level.pointing.vector[None])[:, 0]
+            steer = at.pointing_itrf if level.pointing is None else at.earth.itrf(level.pointing.vector[None])[:, 0]
             f0 = np.full(channels, self.reference_frequency) if self.reference_frequency else at.freq_hz
             waves = (at.freq_hz[:, None, None] * at.itrf[:, None] - (f0[:, None] * steer[:, None])[:, :, None]) / light
             offsets, which = level.distinct

@@ -34,7 +34,8 @@ class Sampling:
 
     Everything geometric is worked out when asked for, once. `seen`, `seen_east` (T, S, 3) and `seen_centre` (T, 3)
     override the ITRF directions, the east vectors across them and the phase centre, for work with another program's
-    frames; `towards` drops the first two, which belong to the directions.
+    frames; `towards` drops the first two, which belong to the directions. Beams point at `steered`, the phase centre
+    unless given: it stays where data are turned to another phase centre.
     """
 
     __repr__ = short_repr
@@ -48,6 +49,7 @@ class Sampling:
     seen: Float | None = None
     seen_east: Float | None = None
     seen_centre: Float | None = None
+    steered: Direction | None = None
 
     @classmethod
     @checked
@@ -120,9 +122,21 @@ class Sampling:
     @cached_property
     def centre_itrf(self) -> Float:
         """Apparent ITRF unit vector of the phase centre (T, 3)."""
-        if self.seen_centre is not None:
+        if self.seen_centre is not None and self.steered is None:
             return self.seen_centre
         return self.earth.itrf(self.centre.vector[None])[:, 0]
+
+    @property
+    def pointing(self) -> Direction:
+        """Where beams point: the phase centre, or the one from which data were turned to another."""
+        return self.steered or self.centre
+
+    @cached_property
+    def pointing_itrf(self) -> Float:
+        """Apparent ITRF unit vector of the pointing (T, 3)."""
+        if self.seen_centre is not None:
+            return self.seen_centre
+        return self.earth.itrf(self.pointing.vector[None])[:, 0]
 
     @cached_property
     def east_itrf(self) -> Float:
@@ -194,6 +208,13 @@ class Sampling:
         """Station coordinates u, v, w in m about the array's centre (T, A, 3); u_ab = u_a - u_b."""
         relative = self.layout.positions_m - self.layout.centre_m
         return relative[None] @ np.swapaxes(self.earth.uvw_axes(self.centre), 1, 2)
+
+
+def times_of(slots_s: Float) -> Any:
+    """UTC `Time` (T,) of MJD seconds."""
+    from astropy.time import Time
+
+    return Time(slots_s // 86400, (slots_s % 86400) / 86400, format="mjd", scale="utc")
 
 
 def mjd_seconds(times: Any) -> Float:

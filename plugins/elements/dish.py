@@ -46,7 +46,7 @@ class Airy(ElementBeam):
         """J of the dish, (T, F, A, S, 2, 2)."""
         from scipy.special import j1
 
-        angle = separation(at.vectors, at.centre)
+        angle = separation(at.vectors, at.pointing)
         x = np.pi * self.diameter * at.freq_hz[:, None] / LIGHT * np.sin(np.minimum(angle, np.pi / 2))
         with np.errstate(divide="ignore", invalid="ignore"):
             return _dish(np.where(np.abs(x) > 1e-8, 2 * j1(x) / x, 1.0), at)
@@ -78,6 +78,6 @@ class Gaussian(ElementBeam):
 
     def jones(self, at: Sampling) -> Complex:
         """J of the dish, (T, F, A, S, 2, 2)."""
-        angle = separation(at.vectors, at.centre)
+        angle = separation(at.vectors, at.pointing)
         width = self.fwhm * (self.frequency / at.freq_hz if self.frequency else np.ones(len(at.freq_hz)))
         return _dish(np.exp(-2 * np.log(2) * (angle / width[:, None]) ** 2), at)

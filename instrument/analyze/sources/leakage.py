@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from instrument import mat2
-from instrument.analyze.sources.photometry import SourceFluxes
+from instrument.analyze.sources.fluxes import SourceFluxes
 from instrument.checked import checked
 from instrument.jones.chain import Chain
 from instrument.jones.mueller import TO_LINEAR, TO_STOKES

@@ -37,7 +37,7 @@ class OffsetSums:
 
     def add(self, block: Visibilities, stokes_i: Complex) -> None:
         """Add a block: its coordinates and weights, and R sets of Stokes I visibilities (R, T, F, B)."""
-        weights = np.broadcast_to(block.effective_weight, block.data.shape[:3])
+        weights = np.broadcast_to(block.stokes_weight[..., 0], block.data.shape[:3])
         if self.right is None:
             self.right = np.zeros((len(self.normal), len(stokes_i)))
         for t in range(block.at.shape[0]):

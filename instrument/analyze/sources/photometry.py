@@ -13,6 +13,7 @@ from typing import Annotated
 import numpy as np
 
 from instrument.analyze.sources.blanks import CHUNKS, FREE, PLACES, excess, places
+from instrument.analyze.sources.fluxes import SourceFluxes, StokesSums
 from instrument.analyze.sources.patches import gathered, gathered_square, groups, mixture
 from instrument.analyze.sources.told_apart import coincide, conjugate_gradients, mirrored, positive_solve
 from instrument.component import Component
@@ -31,34 +32,10 @@ PRODUCTS = 2.5e10  # of a PSF matrix that is made for errors alone: 1 s
 ROUNDING = 4 * float(np.finfo(float).eps)  # of sum w |V|^2, below which nothing is known of what a solution leaves
 
 
-@dataclass(frozen=True)
-class SourceFluxes:
-    """Measured Stokes fluxes in Jy (F, G, 4) of G groups of sources (a patch, or a source by itself).
-
-    The sources of a patch keep the shares of its Stokes I that they have in the sky, channel by channel.
-    `error_jy` is the rms of what the solution leaves in the real or imaginary part of the visibilities times the root
-    of the diagonal of (A^H W A)^-1: right for noise, for sources that are close together or resolved too. What sources
-    outside the sky leave, and the change of apparent fluxes with time and baseline, is not independent: what it adds
-    up to at 32 blank places beside the sources (1 to 10 / median baseline from them) scales the error, for each Stokes
-    parameter by itself, where sums over 16 chunks of time scatter by more than noise. It is known to 1 / 8 there, and
-    is that of the mean of the sources: true errors in the scene mock-grid are 0.6 (centre) to 1.2 times (4 to 5 deg) as
-    large for linear leakage, 1.4 times for circular. It is never below what rounding hides, 3e-8 of the rms visibility.
-    """
-
-    names: tuple[str, ...]
-    ra_rad: Float
-    dec_rad: Float
-    model_jy: Float  # (F, G, 4), what the sky has there
-    stokes_jy: Float  # (F, G, 4)
-    error_jy: Float  # (F, G, 4)
-    freq_hz: Float
-    outcome: tuple[Outcome, ...]  # per channel
-    iterations: int
-
-
 class ForcedPhotometry(Component):
     """Joint least-squares fluxes at known positions, (F, G, 4); sources of one patch are measured as one.
 
+    Where correlations have weights of their own, each Stokes parameter is solved with the weights that it has.
     `uv_range` in wavelengths; `every` takes only each n-th integration (the answer is the mean over those). Stops when
     the residual of the normal equations is below `accuracy` of its start.
     """
@@ -75,9 +52,9 @@ class ForcedPhotometry(Component):
             total.add(block)
         return total.finish()
 
-    def start(self, sky: PointSky) -> PhotometrySums:
+    def start(self, sky: PointSky) -> StokesSums:
         """Sums to which blocks are added one by one."""
-        return PhotometrySums(self, sky)
+        return StokesSums(PhotometrySums(self, sky))
 
 
 @dataclass

@@ -10,8 +10,9 @@ from typing import Any, Literal
 import numpy as np
 
 from instrument.analyze.analyzer import Analyzer
+from instrument.analyze.sources.fluxes import SourceFluxes
 from instrument.analyze.sources.leakage import CLEAR, Leakage, expected_percent
-from instrument.analyze.sources.photometry import ForcedPhotometry, SourceFluxes
+from instrument.analyze.sources.photometry import ForcedPhotometry
 from instrument.errors import InputError, Outcome
 from instrument.observe.sampling import Sampling
 from instrument.pipeline.stage import Draw, Running, StageResult, StageRun
