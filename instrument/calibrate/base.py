@@ -88,6 +88,13 @@ class Solution:
         found = term.jones(where)[:, :, :, 0]
         return np.broadcast_to(found, self.jones.shape)
 
+    def inverse(self) -> JonesTable:
+        """The term that undoes `term`: `vis.corrupted(solution.inverse())` is `vis.corrected(solution.term)`.
+
+        Put it in a chain to take the errors out of it; NaN where there is no solution.
+        """
+        return self.term.inverse()
+
     def aligned(self, to: Complex) -> Solution:
         """The same solution, the freedom of its gauge used to come as near as can be to matrices (t, f, A, 2, 2)."""
         to = np.asarray(to)

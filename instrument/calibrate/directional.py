@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal, overload
 
 import numpy as np
@@ -14,73 +14,17 @@ from pydantic import BeforeValidator
 
 from instrument.calibrate.base import Calibrator, Solution, by_baseline, pair
 from instrument.calibrate.clusters import Block, Limits
+from instrument.calibrate.directional_solution import DirectionalSolution, Models
 from instrument.calibrate.gauge import gauge_of
 from instrument.checked import checked
-from instrument.errors import InputError, InstrumentError, Outcome, did_you_mean
+from instrument.errors import InputError, Outcome, did_you_mean
 from instrument.jones.base import JonesTerm
 from instrument.jones.table import JonesTable
 from instrument.predict.threads import ONE_THREAD, look_again
-from instrument.shown import short_repr
 from instrument.units import Bool, Complex, Count, Float, Int, Metres, Positive, PositiveSeconds, Real, to_si
 from instrument.visibilities import Visibilities
 
 ALL = "all"  # the cluster of a model that is not in parts
-Models = Mapping[str, Visibilities]
-
-
-@dataclass(frozen=True, eq=False)
-class DirectionalSolution:
-    """A `Solution` for each cluster, by name: `solution["3C196"].term` is the station term of that direction."""
-
-    __repr__ = short_repr
-    clusters: dict[str, Solution]
-
-    def __getitem__(self, name: str) -> Solution:
-        if name not in self.clusters:
-            raise InputError(f"no cluster '{name}': {did_you_mean(name, self.clusters)}")
-        return self.clusters[name]
-
-    def predicted(self, models: Models, keep: Collection[str] = ()) -> Visibilities:
-        """The sum of J_a^c M_ab^c J_b^cH over clusters not in `keep`; flagged where a solution is missing."""
-        for name in (*self.clusters, *keep):
-            if name not in models:
-                raise InputError(f"no model of cluster '{name}': {did_you_mean(name, models)}")
-        first = next(iter(models.values()))
-        total = replace(first, data=np.zeros_like(first.data, complex))
-        for name in self.clusters:
-            if name not in keep:
-                total = _plus(total, models[name], self[name].term)
-        return total
-
-    def subtracted(self, data: Visibilities, models: Models, keep: Collection[str] = ()) -> Visibilities:
-        """The data without the clusters (except those in `keep`); zero and flagged where a solution is missing."""
-        model = self.predicted(models, keep)
-        bad = (model.flag & ~data.flag) | ~np.isfinite(data.data).all(axis=(-2, -1))
-        empty = np.broadcast_to(bad, data.data.shape[:3])[..., None, None]
-        left = data.with_data(np.where(empty, 0.0, data.data)).flagged(bad) - model
-        return replace(left, data=np.where(empty, 0.0, left.data))
-
-    def check(self) -> None:
-        """Raise `InstrumentError` when an interval of a cluster has not converged."""
-        for name, solution in self.clusters.items():
-            try:
-                solution.check()
-            except InstrumentError as error:
-                raise InstrumentError(f"cluster '{name}': {error}") from None
-
-    def __str__(self) -> str:
-        return "\n".join(f"{name}: {solution}" for name, solution in self.clusters.items())
-
-
-def _plus(total: Visibilities, model: Visibilities, term: JonesTerm) -> Visibilities:
-    """The sum of visibilities and a corrupted model. Where the model is zero, no solution is needed."""
-    if not np.isfinite(model.data).all():
-        model = replace(model, data=np.where(np.isfinite(model.data), model.data, np.nan + 0j))
-    empty = np.all(model.data == 0, axis=(-2, -1))
-    found = model.corrupted(term).data
-    bad = ~np.isfinite(found).all(axis=(-2, -1)) & ~empty
-    found = np.where((bad | empty)[..., None, None], 0.0, found)
-    return replace(total, data=total.data + found, flag=total.flag | bad)
 
 
 def _seconds_by_name(given: Any) -> Any:

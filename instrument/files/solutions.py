@@ -14,7 +14,7 @@ import numpy as np
 
 from instrument import mat2
 from instrument.calibrate.base import Solution
-from instrument.calibrate.directional import DirectionalSolution
+from instrument.calibrate.directional_solution import DirectionalSolution
 from instrument.checked import checked
 from instrument.errors import FileError, InputError, did_you_mean
 from instrument.files.h5parm import AXES, KINDS, POLS, read_soltabs

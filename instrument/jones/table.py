@@ -7,6 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import model_validator
 
+from instrument import mat2
 from instrument.checked import checked
 from instrument.errors import InputError
 from instrument.jones.base import Basis, JonesTerm
@@ -54,6 +55,14 @@ class JonesTable(JonesTerm):
             if not np.all(np.isfinite(axis)) or np.any(np.diff(axis) <= 0):
                 raise InputError(f"{name} must be finite and ascending")
         return self
+
+    def inverse(self) -> JonesTable:
+        """The table of J^-1, entry by entry; NaN where a matrix has none.
+
+        `vis.corrected(table)` is `vis.corrupted(table.inverse())`, and the one undoes the other. Between entries
+        ("linear") the inverse of what lies between two is not what lies between two inverses.
+        """
+        return self.with_fields(values=mat2.inverse(self.values))
 
     def jones(self, at: Sampling) -> Complex:
         """The matrices at the times and channels of a sampling, (T, F, A, 1, 2, 2)."""
