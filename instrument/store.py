@@ -62,8 +62,7 @@ def _fixed(block: Any, texts: bool = True) -> dict[str, Any]:
     state, at = block.beam_state, block.at
     out = {name: getattr(block, name) for name in FIXED[:2]} | {name: getattr(at, name) for name in FIXED[2:4]}
     out["centre"] = np.array(at.centre)
-    if at.steered is not None:
-        out["steered"] = np.array(at.steered)
+    out["steered"] = np.array(at.steered or ())  # written where beams do not point at the centre
     if not texts:
         return out
     beams = None if state.beams is None else state.beams.to_dict()
@@ -105,9 +104,8 @@ class StoreWriter:
         """Write a block."""
         # a chain takes 20 ms to be spelled out: not again where it is the same object
         seen = block.layout is self.known[0] and block.beam_state is self.known[1]
-        fixed = _fixed(block, texts=not seen)
-        for name in dict.fromkeys((*fixed, *(k for k in self.fixed if k not in FIXED[-2:]))):
-            if not np.array_equal(fixed.get(name), self.fixed.get(name)):
+        for name, value in _fixed(block, texts=not seen).items():
+            if not np.array_equal(value, self.fixed[name]):
                 error = BeamStateError if name == "beam_state" else InputError
                 raise error(f"the blocks differ in {name}: save each kind in a file of its own")
         t, f = _rows(self.slots, block.at.slots_s, "times"), _rows(self.channels, block.freq_hz, "channels")
@@ -148,7 +146,8 @@ class StoreWriter:
         for one in self.spread.values():
             one.finish()
         for name, value in self.fixed.items():
-            self.file[name] = value
+            if value.size:
+                self.file[name] = value
         self.file.attrs.update({"format": FORMAT, "version": VERSION, **written_by()})
         self.created.close()
 
@@ -218,9 +217,8 @@ class Store:
             self.written = {str(k): h5.text(v) for k, v in file.attrs.items()}
         texts = {name: small[name].astype(np.uint8).tobytes().decode("utf-8", "replace") for name in FIXED[-2:]}
         self.slots_s, self.freq_hz = small["slots_s"], small["freq_hz"]
-        numbers = (self.slots_s, self.freq_hz, small["centre"], small["earth_matrices"], small["earth_velocity"])
-        numbers = (*numbers, small.get("steered", np.zeros(2)))
-        if not all(np.isfinite(x).all() for x in numbers) or (self.freq_hz <= 0).any():
+        places = [small[name] for name in ("centre", "earth_matrices", "earth_velocity", "steered") if name in small]
+        if not all(np.isfinite(x).all() for x in (self.slots_s, self.freq_hz, *places)) or (self.freq_hz <= 0).any():
             raise FileError(f"{self.name}: times, frequencies or coordinates are not finite, or not above 0")
         try:
             self.layout = Layout.from_json(texts["layout"])

@@ -51,12 +51,13 @@ class DirectionalSolution:
 
     def _chosen(self, keep: str | Collection[str], only: str | Collection[str] | None) -> list[str]:
         """The clusters that are summed; raises `InputError` for names of none, and for both ways at once."""
-        kept, wanted = (None if some is None else [some] if isinstance(some, str) else some for some in (keep, only))
-        if kept and wanted is not None:
+        if keep and only is not None:
             raise InputError("keep= and only= say the same in two ways: give one of them")
-        for name in (*(kept or ()), *(wanted or ())):
+        named = keep if only is None else only
+        names = [named] if isinstance(named, str) else list(named)
+        for name in names:
             self[name]
-        return [name for name in self.clusters if (name not in kept if wanted is None else name in wanted)]
+        return [name for name in self.clusters if (name in names) == (only is not None)]
 
     def subtracted(
         self,

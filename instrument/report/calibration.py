@@ -1,62 +1,66 @@
-"""Figures of a calibration: solved gains against time for each station, convergence, residual of every interval."""
+"""Figures of a calibration: how each interval ended, convergence, residuals, errors of common directions."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
+from instrument.errors import InputError, Outcome
+from instrument.report.spectra import LOOKS
+from instrument.report.stations import NOTHING, SMALLEST, Along
 from instrument.report.style import BLUE, GREY, ORANGE, axes_of, styled
+from instrument.units import Float
 
 if TYPE_CHECKING:
     from instrument.calibrate.base import Solution
 
+MARKED = 40  # intervals whose values have markers of their own
+# the worst last, as it is what a column of several intervals shows; colours that the night leaves alone
+ENDED = (
+    (Outcome.CONVERGED, "converged", "#56B4E9"),
+    (Outcome.POOR_FIT, "poor fit", "#E0522D"),
+    (Outcome.ITERATION_LIMIT, "iteration limit", "#E69F00"),
+    (Outcome.SINGULAR, "singular", "#CC79A7"),
+    (Outcome.NON_FINITE, "not finite", "#F0E442"),
+    (Outcome.REFUSED, "refused, no data", "#8E6BBF"),
+)
+
 
 @styled
-def gains(solution: Solution, channel: int = 0) -> Figure:
-    """Amplitude and phase of both receptors of every station (A rows) against time, as images in one figure.
-
-    Departures from the median of each station; phases relative to the first station. Grey is no solution. Names of
-    stations are every so many of them, where the solution has names.
-    """
-    jones = solution.jones[:, channel]
-    hours = (solution.term.slots_s - solution.term.slots_s[0]) / 3600
-    figure = Figure(figsize=(7.2, 8.4), layout="constrained")
-    grid = figure.subplots(2, 2, sharex=True, sharey=True)
-    step = solution.interval_s / 3600
-    names = solution.term.stations or tuple(map(str, range(jones.shape[1])))
-    rows = np.arange(0, len(names), max(1, -(-len(names) // 12)))
-    extent = (hours[0] - step / 2, hours[-1] + step / 2, jones.shape[1] - 0.5, -0.5)
-    for k, receptor in enumerate("pq"):
-        g = jones[:, :, k, k]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            size = np.where(np.isfinite(g).any(axis=0), np.abs(g), 0.0)  # 0: stations that have no solution at all
-            amplitude = size / np.nanmedian(size, axis=0) - 1
-            phase = np.rad2deg(np.angle(g * np.conj(g[:, :1])))
-        percent = "amplitude, less 1 (%)"
-        for ax, values, what in ((grid[0, k], 100 * amplitude, percent), (grid[1, k], phase, "phase (deg)")):
-            good = values[np.isfinite(values)]
-            high = float(np.percentile(np.abs(good), 99)) if good.size else 1.0
-            drawn = ax.imshow(
-                values.T,
-                aspect="auto",
-                extent=extent,
-                cmap="RdBu_r",
-                vmin=-high or -1,
-                vmax=high or 1,
-                interpolation="none",
-            )
-            ax.set_title(f"{receptor}: {what}")
-            ax.set_facecolor("#bbbbbb")
-            figure.colorbar(drawn, ax=ax, fraction=0.05, pad=0.02).locator = MaxNLocator(5)
-    for ax in grid[:, 0]:
-        ax.set_yticks(rows, [names[k] for k in rows], fontsize=10)
-    for ax in grid[1]:
-        ax.set_xlabel("time (h)")
-    return figure
+def outcomes(solution: Solution, ax: Axes | None = None) -> Axes:
+    """How every interval and channel ended (t, f), as a map in time and frequency, with how many ended how."""
+    times, channels = solution.outcome.shape
+    ax = axes_of(ax, (6.4, 2.2 if channels == 1 else 4.8))
+    along = Along.times(solution.term.slots_s, solution.interval_s)
+    code = np.zeros((times, channels))
+    for k, (outcome, _, _) in enumerate(ENDED):
+        code[solution.outcome == outcome] = k
+    up = Along.channels(solution.term.freq_hz)
+    colours = ListedColormap([colour for _, _, colour in ENDED])
+    ax.imshow(
+        up.gathered(along.gathered(code)).T,
+        aspect="auto",
+        origin="lower",
+        extent=(*along.ends, *up.ends),
+        interpolation="none",
+        cmap=colours,
+        norm=BoundaryNorm(np.arange(len(ENDED) + 1) - 0.5, len(ENDED)),
+    )
+    ax.set_facecolor(NOTHING)
+    ax.set_xlabel(along.label)
+    if channels == 1:
+        ax.set_yticks([])
+    else:
+        ax.set_ylabel("frequency (MHz)")
+    counts = [(name, colour, int((solution.outcome == o).sum())) for o, name, colour in ENDED]
+    keys = [Patch(color=colour, label=f"{name} ({count})") for name, colour, count in counts if count]
+    ax.legend(handles=keys, frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderpad=0.2)
+    return ax
 
 
 @styled
@@ -77,12 +81,58 @@ def convergence(solution: Solution, ax: Axes | None = None) -> Axes:
 def residuals(solution: Solution, channel: int = 0, ax: Axes | None = None) -> Axes:
     """Rms of V - J M J^H over the rms of V in each interval (t,), log scale; intervals that failed are crosses."""
     ax = axes_of(ax, (6.4, 4.6))
-    hours = (solution.term.slots_s - solution.term.slots_s[0]) / 3600
-    value = np.maximum(solution.residual[:, channel], 1e-17)
+    along, middle = _middles(solution)
+    value = np.maximum(solution.residual[:, channel], SMALLEST)
     good = solution.converged[:, channel]
-    ax.semilogy(hours[good], value[good], ".", color=BLUE, label="converged")
+    ax.set_yscale("log")
+    if good.any():
+        ax.plot(middle[good], value[good], ".", color=BLUE, label="converged")
     if not good.all():
-        ax.semilogy(hours[~good], value[~good], "x", color=ORANGE, label=f"failed ({int((~good).sum())})")
-    ax.set(xlabel="time since the first interval (h)", ylabel="residual over data (rms)")
+        ax.plot(middle[~good], value[~good], "x", color=ORANGE, label=f"failed ({int((~good).sum())})")
+    ax.set(xlabel=along.label, ylabel="residual over data (rms)", xlim=along.ends)
     ax.legend(frameon=False)
     return ax
+
+
+@styled
+def common_errors(solution: Solution, channel: int = 0, ax: Axes | None = None) -> Axes:
+    """Standard errors of the common directions of all stations (t, n) against time, log scale; largest first.
+
+    Triangles on the upper edge are directions that the model leaves free. Raises `InputError` where none are known.
+    """
+    errors = np.asarray(solution.common_error, float)
+    if np.isnan(errors).all():
+        raise InputError("this solution does not know the errors of its common directions")
+    errors = np.broadcast_to(errors, (*solution.outcome.shape, errors.shape[-1]))[:, channel]
+    ax = axes_of(ax, (6.4, 4.8))
+    along, middle = _middles(solution)
+    known = np.isfinite(errors) & (errors > 0)
+    top = 3 * float(errors[known].max()) if known.any() else 1.0
+    # a line ends at a gap, and has markers where there is room for them
+    ahead = np.flatnonzero(np.diff(middle) > 1.5 * np.diff(middle).min(initial=np.inf)) + 1
+    few = len(middle) <= MARKED
+    for k, each in enumerate(errors.T):
+        if np.isnan(each).all():
+            continue
+        colour, marker = LOOKS[k % len(LOOKS)]
+        free = np.flatnonzero(np.isposinf(each))
+        shown = np.insert(np.where(known[:, k], each, np.nan), ahead, np.nan)
+        line = ("-", "--")[k // len(LOOKS) % 2]
+        look: Any = {"color": colour, "marker": marker if few else "", "ms": 5, "lw": 1.4, "ls": line}
+        name = f"direction {k + 1}" + (", free" if len(free) == len(each) else "")
+        ax.plot(np.insert(middle, ahead, np.nan), shown, label=name, **look)
+        some = free[:: -(-len(free) // MARKED) or 1]
+        ax.plot(middle[some], np.full(len(some), top), color=colour, marker="^", ms=6, ls="", clip_on=False)
+    ax.set(yscale="log", xlabel=along.label, ylabel="standard error of a common direction", xlim=along.ends)
+    ax.set_ylim(top=top)
+    ax.grid(color="#dddddd", lw=0.6, axis="y")
+    ax.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=3, borderpad=0.2, columnspacing=1.2)
+    return ax
+
+
+def _middles(solution: Solution) -> tuple[Along, Float]:
+    """The axis of time, and where the middle of each interval (t,) is on it."""
+    along = Along.times(solution.term.slots_s, solution.interval_s)
+    slots = solution.term.slots_s
+    share = (slots - slots[0] + solution.interval_s / 2) / (slots[-1] - slots[0] + solution.interval_s)
+    return along, along.ends[0] + share * (along.ends[1] - along.ends[0])

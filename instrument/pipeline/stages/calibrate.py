@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 
 from instrument.analyze.analyzer import Analyzer
 from instrument.calibrate.als import LANES
 from instrument.calibrate.base import Calibrator, Solution
+from instrument.calibrate.by_station import rms_by_station
 from instrument.calibrate.di_errors import NAMES, DIComparison, DISums
 from instrument.calibrate.selfcal import SelfCal
 from instrument.component import KIND, Component
@@ -83,7 +84,7 @@ class Calibrate(Stage):
             held_bytes=drawn.held_bytes + solved.held_bytes,
             block_bytes=drawn.block_bytes + solved.block_bytes,
             result_bytes=drawn.result_bytes + solved.held_bytes,
-            figures=4 if drawn.does else 3,
+            figures=5 + bool(drawn.does) + (run.plan.problem.shape[1] > 1),
         )
 
     def start(self, run: Running) -> StageRun:
@@ -103,6 +104,8 @@ class _CalibrateRun(StageRun):
     parts: list[Solution] = field(default_factory=list)
     errors: DISums | None = None
     power: dict[str, float] = field(default_factory=dict)
+    left: list[Float] = field(default_factory=list)  # of the corrected less the model, (T, A) of each block
+    slots_s: list[Float] = field(default_factory=list)
     put_in: Float = field(default_factory=lambda: np.zeros(3))  # |J - 1|^2 on and off the diagonal, and how many
 
     @property
@@ -136,6 +139,9 @@ class _CalibrateRun(StageRun):
             for name, make in zip(IMAGES, made, strict=True):
                 part = make()
                 self.power[name] = self.power.get(name, 0.0) + float((np.abs(part.data) ** 2).sum())
+                if name == IMAGES[-1]:
+                    self.left.append(rms_by_station(part, model))
+                    self.slots_s.append(block.at.slots_s)
                 if self.images:
                     self.images[name].add(part.flagged(corrected.flag))
         self.power["model"] = self.power.get("model", 0.0) + float((np.abs(model.data) ** 2).sum())
@@ -150,7 +156,18 @@ class _CalibrateRun(StageRun):
         image = self.run.stage("image", Image)
         uv_range = None if image is None else image.imager.uv_range
         rms = {k: float(np.sqrt(v)) for k, v in self.power.items()}
-        return CalibrationResult(solution, errors, cubes, rms, uv_range)
+        left = LeftByStation(
+            np.concatenate(self.left), np.concatenate(self.slots_s), self.run.plan.problem.interval_s,
+        )  # fmt: skip
+        return CalibrationResult(solution, errors, cubes, rms, uv_range, left)
+
+
+class LeftByStation(NamedTuple):
+    """Corrected less model over the model, rms on the baselines of each station (T, A), of integrations (T,)."""
+
+    share: Float
+    slots_s: Float
+    interval_s: float
 
 
 @dataclass(frozen=True)
@@ -164,6 +181,7 @@ class CalibrationResult(StageResult):
     cubes: dict[str, StokesCube]
     rms: dict[str, float]
     uv_range: tuple[float, float] | None = None  # of the images
+    left: LeftByStation | None = None
 
     @property
     def passed(self) -> bool:
@@ -217,8 +235,9 @@ class CalibrationResult(StageResult):
 
     def sections(self, draw: Draw) -> list[Section]:
         """Errors of the solutions, gains against time, how it converged, and what is left."""
-        from instrument.report.calibration import convergence, gains, residuals
+        from instrument.report.calibration_page import solution_figures
         from instrument.report.spectra import spectra_2d
+        from instrument.report.stations import left_by_stations
 
         solution = self.solution
         blocks: list[Block] = [Text(str(solution))]
@@ -227,17 +246,11 @@ class CalibrationResult(StageResult):
             made = Table.of(self.errors.table(), text)
             heads = [made.columns[0], *(f"{name.upper()} (%)" for name in NAMES)]
             blocks.append(replace(made, columns=heads))
-        if not np.isfinite(solution.jones).any():
-            blocks.append(Text("No interval has a solution, so there is nothing to draw."))
-            return [Section("Calibration", blocks)]
-        text = "Solved gains of every station against time: amplitude over its median, less 1, and phase; grey: none."
-        entries = [draw("gains", gains(solution), text)]
-        if (solution.history > 0).any():
-            text = "How the solve converged: the slowest interval."
-            entries.append(draw("convergence", convergence(solution), text))
-        if np.isfinite(solution.residual).any():
-            text = "What the solutions leave of the data they were solved from."
-            entries.append(draw("residual", residuals(solution), text))
+        entries = solution_figures(solution, draw)
+        if self.left is not None and np.isfinite(self.left.share).any():
+            text = "What calibration leaves on the baselines of each station: corrected less model; grey: no data."
+            shown = left_by_stations(*self.left, solution.term.stations)
+            entries.append(draw("residual_stations", shown, text))
         if self.cubes:
             text = "2D power spectra of what calibration leaves in the images, Hann taper; the PSF stays."
             entries.append(draw("calibration_spectra", spectra_2d(self.spectra()), text))
