@@ -9,7 +9,7 @@ import numpy as np
 
 from instrument.report.calibration import common_errors, convergence, outcomes, residuals
 from instrument.report.page import FigureEntry
-from instrument.report.stations import bandpass, gain_errors, gains
+from instrument.report.stations import COLUMNS, bandpass, gain_errors, gains
 
 if TYPE_CHECKING:
     from instrument.calibrate.base import Solution
@@ -20,7 +20,7 @@ def solution_figures(solution: Solution, draw: Callable[..., FigureEntry]) -> li
 
     `draw` takes a name, a drawing and a caption, as `report.style.drawer` makes it.
     """
-    several = "; of several in one column the worst is shown" if len(solution.outcome) > 1 else ""
+    several = "; of several in one column the worst is shown" if max(solution.outcome.shape) > COLUMNS else ""
     entries = [draw("outcomes", outcomes(solution), f"How the solve of every interval ended{several}; grey: no data.")]
     if np.isfinite(solution.jones).any():
         middle = solution.jones.shape[1] // 2

@@ -24,6 +24,7 @@ NOTHING = "#bbbbbb"  # no solution, no data
 UNITS = (("s", 1.0), ("min", 60.0), ("h", 3600.0), ("d", 86400.0))
 FEW = 3  # entries of a station that have a median of their own
 TURNED = 100.0  # deg of phase beyond which colours go round
+SEEN = 1e-10  # % or deg below which differences are rounding, and have no colours of their own
 SMALLEST = 1e-17  # of an axis of shares: below rounding
 
 
@@ -116,7 +117,7 @@ def _signed(figure: Figure, ax: Axes, shown: Float, along: Along, title: str, tu
     good = shown[np.isfinite(shown)]
     high = float(np.percentile(np.abs(good), 99)) if good.size else 1.0
     round_ = turns and high > TURNED
-    high = 180.0 if round_ else high or 1.0
+    high = 180.0 if round_ else high if high > SEEN else 1.0
     drawn = _image(ax, shown, along, cmap="twilight_shifted" if round_ else "RdBu_r", vmin=-high, vmax=high)
     ax.set_title(title)
     beyond = "neither" if round_ or not good.size or np.abs(good).max() <= high else "both"

@@ -10,6 +10,7 @@ from astropy.coordinates import SkyCoord
 import instrument
 from instrument import Chain, GainTerm, InputError, JonesTable, Observation, Outcome, PointSky, Scene, SelfCal
 from instrument.calibrate.base import Solution
+from instrument.calibrate.by_station import rms_by_station
 from instrument.calibrate.directional_solution import DirectionalSolution
 from instrument.calibrate.gauge import gauge_of
 
@@ -124,3 +125,23 @@ def test_the_inverse_of_a_solve_takes_the_errors_out():
     solution = SelfCal(pattern="diagonal", tolerance=1e-10).solve(model.corrupted(errors), model)
     found = model.corrupted(errors).corrupted(solution.inverse())
     assert np.abs(found.data - model.data).max() < 1e-8
+
+
+def test_what_is_left_is_told_by_station_and_integration():
+    data, _, _ = laboratory()
+    share = np.full(data.data.shape[:3], 0.1)
+    share[1] *= 3
+    hit = (data.antenna1 == 2) | (data.antenna2 == 2)
+    share[:, :, hit] *= 2
+    left = data.with_data(data.data * share[..., None, None])
+    power = (np.abs(data.data) ** 2).sum(axis=(1, 3, 4))
+    for a in range(4):
+        own = (data.antenna1 == a) | (data.antenna2 == a)
+        due = np.sqrt((share[:, 0, own] ** 2 * power[:, own]).sum(axis=1) / power[:, own].sum(axis=1))
+        assert np.allclose(rms_by_station(left, data)[:, a], due, rtol=1e-13)
+    flag = np.zeros(data.data.shape[:3], bool)
+    flag[:, :, hit] = True
+    spoilt = left.with_data(np.where(flag[..., None, None], np.nan, left.data)).flagged(flag)
+    found = rms_by_station(spoilt, data)
+    assert np.isnan(found[:, 2]).all()
+    assert np.allclose(found[:, [0, 1, 3]], np.array([0.1, 0.3, 0.1, 0.1])[:, None], rtol=1e-13)
