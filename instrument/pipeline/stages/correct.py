@@ -11,6 +11,7 @@ from instrument.scene import Scene
 
 BLOCK = 8e-3  # seconds of a block, for where the phase centre stands and the beam there
 
+
 class Correct(Stage):
     """Takes effects out of the visibilities: `beam = "centre"` the beam towards the phase centre."""
 
