@@ -131,6 +131,8 @@ class Solution:
             spoilt=sum((Counter(p.spoilt) for p in parts), Counter()),
             unexplained=np.concatenate([np.broadcast_to(p.unexplained, p.outcome.shape) for p in parts]),
             notes=tuple(dict.fromkeys(text for p in parts for text in p.notes)),
+            error=_along([p.error for p in parts], [p.jones.shape for p in parts]),
+            common_error=_along([p.common_error for p in parts], [(*p.outcome.shape, 0) for p in parts]),
         )
 
     def __str__(self) -> str:
@@ -147,6 +149,18 @@ class Solution:
                 *self.doubts,
             )
         )
+
+
+def _along(given: Sequence[Float], shapes: Sequence[tuple[int, ...]]) -> Float:
+    """Errors of blocks as one, each of its shape or of length 1 where constant; the last axis is the longest."""
+    if all(np.isnan(x).all() for x in given):
+        return given[0]
+    last = max(x.shape[-1] for x in given)
+    parts = []
+    for x, shape in zip(given, shapes, strict=True):
+        longer = np.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, last - x.shape[-1])], constant_values=np.nan)
+        parts.append(np.broadcast_to(longer, (*shape[:-1], last)))
+    return np.concatenate(parts)
 
 
 @checked

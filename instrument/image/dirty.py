@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from instrument.checked import checked
-from instrument.errors import InputError, RefusedError
+from instrument.errors import InputError, RefusedError, warn
 from instrument.image.base import AnyImager, ImageSums
 from instrument.image.cube import StokesCube
 from instrument.image.psf import fit_psf
@@ -23,6 +23,7 @@ from instrument.visibility_sets import as_set
 
 HELD = 400_000  # visibilities of a channel gridded at once: more makes a call of 512 pixels 6 % cheaper at most
 ALL_HELD = 5 * HELD  # visibilities that wait in all channels together: bounds memory (192 MB)
+ALIKE = 1e-3  # of the peak, by which the PSF of U and V may differ from that of I unsaid
 WAITING = 96  # bytes of a visibility that waits: u, v, w, weight, I, Q, U, V
 
 
@@ -89,6 +90,7 @@ class _Channel:
         self.waiting: list[tuple[Float, Float, Complex]] = []
         self.count = 0
         self.weight = np.zeros(4)  # of I, Q, U, V
+        self.crossed: Float | None = None  # the PSF of U and V (N, N), where their weights are not those of I and Q
 
     @cached_property
     def sums(self) -> Float:
@@ -140,8 +142,12 @@ class Images(ImageSums):
         waiting = ((uvw, np.broadcast_to(w, (len(w), most)), values) for uvw, w, values in channel.waiting)
         uvw, weight, stokes = (np.concatenate(parts) for parts in zip(*waiting, strict=True))
         columns = [*np.moveaxis(stokes, -1, 0), np.ones(len(weight), complex)]
-        weights = np.broadcast_to(weight, (len(weight), 4)).T[[0, 1, 2, 3, 0]]
-        for image, values, each in zip(channel.sums, columns, weights, strict=True):
+        images = [*channel.sums]
+        if most > 1 or channel.crossed is not None:
+            channel.crossed = images[4].copy() if channel.crossed is None else channel.crossed  # alike until now
+            images, columns = [*images, channel.crossed], [*columns, columns[-1]]
+        weights = np.broadcast_to(weight, (len(weight), 4)).T[[0, 1, 2, 3, 0, 2][: len(images)]]
+        for image, values, each in zip(images, columns, weights, strict=True):
             if not values.any():  # a Stokes parameter that is exactly zero
                 continue
             # ducc0 has exp(+2 pi i (u l + v m - w (n-1))) for the adjoint: flip w; x to the west: flip u
@@ -174,15 +180,20 @@ class Images(ImageSums):
             raise RefusedError("no block of visibilities was given: nothing to image")
         pixels = self.imager.pixels
         planes, psfs = np.empty((len(freqs), 4, pixels, pixels)), np.empty((len(freqs), pixels, pixels))
+        apart = 0.0
         for f, freq in enumerate(freqs):
             channel = self.channels[freq]
             self._grid(channel)
             with np.errstate(divide="ignore", invalid="ignore"):
                 np.divide(channel.sums[:4], channel.weight[:, None, None], out=planes[f])
                 np.divide(channel.sums[4], channel.weight[0], out=psfs[f])
+                if channel.crossed is not None and channel.weight[[0, 2]].all():
+                    apart = max(apart, float(np.abs(channel.crossed / channel.weight[2] - psfs[f]).max()))
             del channel.sums  # a sum and its image at once: twice the cube for one channel only
         if not any(self.channels[f].weight.any() for f in freqs):
             raise RefusedError(f"no visibility lies within uv_range = {self.imager.uv_range} with a weight above 0")
+        if apart > ALIKE:
+            warn(f"the PSF of U and V differs by {apart:.2g} of its peak from that of I, which the cube has")
         return StokesCube(
             data=planes,
             frequencies=np.array(freqs) * u.Hz,

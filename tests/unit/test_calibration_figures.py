@@ -1,6 +1,7 @@
 """Pictures of a calibration: nothing that failed is lost in them, whatever the number of intervals and stations."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -83,6 +84,18 @@ def test_phases_are_relative_to_a_station_that_has_solutions():
     solution = made(times=10, count=4, lost=[0])
     phase = drawn(stations.gains(solution).axes[2])
     assert np.isnan(phase[0]).all() and np.abs(phase[1]).max() < 1e-12 and np.abs(phase[2:]).min() > 1e-9
+
+
+def test_errors_of_blocks_are_those_of_the_whole():
+    one, other = made(times=3, count=2), made(times=2, count=2, slots=[3, 4])
+    none = made(times=2, count=2, errors=False, slots=[5, 6])
+    few = replace(other, common_error=other.common_error[..., :2], error=np.full((1, 1, 1, 2, 2), 0.1))
+    whole = Solution.joined([one, few, none])
+    assert whole.error.shape == whole.jones.shape and whole.common_error.shape == (7, 1, 4)
+    assert np.array_equal(whole.error[:3], one.error) and np.all(whole.error[3:5] == 0.1)
+    assert np.array_equal(whole.common_error[3:5, :, :2], few.common_error)
+    assert np.isnan(whole.common_error[3:5, :, 2:]).all() and np.isnan(whole.error[5:]).all()
+    assert Solution.joined([none]).error.shape == (1, 1, 1, 2, 2)
 
 
 def test_one_interval_shows_how_stations_differ():

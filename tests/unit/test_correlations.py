@@ -1,5 +1,6 @@
 """Weights and flags of single correlations: what they mean for visibilities, Stokes parameters and what uses them."""
 
+import warnings
 from dataclasses import replace
 from functools import cache
 
@@ -132,6 +133,11 @@ def test_an_image_of_a_stokes_parameter_is_that_with_its_own_weights(weighting):
         assert np.abs(cube.data[:, k] - one.data[:, k]).max() < 1e-9  # the accuracy asked for, of 5 Jy
         if k == 0:
             assert np.abs(cube.psf.data - one.psf.data).max() < 1e-9
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        imager.image(vis)
+        imager.image(seen().weighted(np.array([[1.0, 0.5], [0.5, 1.0]])[None, None, None]))  # other weights, one PSF
+    assert len([w for w in said if "the PSF of U and V differs by" in str(w.message)]) == 1
     wrong = imager.image(seen().weighted(vis.whole_weight)).data
     assert np.abs(cube.data - wrong).max() > 1e-2
 
