@@ -12,6 +12,7 @@ from astropy.coordinates import SkyCoord
 import instrument
 from instrument import (
     Chain,
+    DirectionalCal,
     FeedTerm,
     GainTerm,
     Imager,
@@ -227,12 +228,13 @@ def test_extreme_weights_are_carried_and_zero_ones_reach_what_they_are_mixed_int
     assert np.isfinite(vis.weighted(np.where(w > 0, w, 1.0)).corrected(full).weight).all()
 
 
-def test_a_solve_takes_visibilities_of_which_all_correlations_are_known():
+@pytest.mark.parametrize("solver", [SelfCal(), DirectionalCal(tolerance=1e-9)], ids=["selfcal", "directional"])
+def test_a_solve_takes_visibilities_of_which_all_correlations_are_known(solver):
     vis, (weight, flag) = seen(), uneven(share=0.05)
     data = vis.corrupted(Chain(GainTerm(rms=0.1, seed=1), FeedTerm(rms=0.1, seed=2)))
-    found = SelfCal().solve(spoilt(data, flag).weighted(weight).flagged(flag), vis)
+    found = solver.solve(spoilt(data, flag).weighted(weight).flagged(flag), vis)
     assert found.converged.all()
-    due = SelfCal().solve(data.weighted(np.where(flag.any(axis=(-2, -1)), 0.0, 1.0)), vis)
+    due = solver.solve(data.weighted(np.where(flag.any(axis=(-2, -1)), 0.0, 1.0)), vis)
     truth = vis.corrupted(due.term).data
     assert np.abs(vis.corrupted(found.term).data - truth).max() < 1e-8
     corrected = spoilt(data, flag).weighted(weight).flagged(flag).corrected(found.term)
