@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,6 +36,7 @@ class Along:
     ends: tuple[float, float]
     column: Int
     count: int
+    ticks: int = 4
 
     @classmethod
     def times(cls, slots_s: Float, step_s: float) -> Along:
@@ -52,7 +53,8 @@ class Along:
         step = step if np.isfinite(step) else 1e6
         number = np.rint((freq_hz - freq_hz[0]) / step).astype(int)
         low = float(freq_hz[0] - step / 2) / 1e6
-        return cls._of(number, "frequency (MHz)", low, low + (int(number[-1]) + 1) * step / 1e6)
+        found = cls._of(number, "frequency (MHz)", low, low + (int(number[-1]) + 1) * step / 1e6)
+        return replace(found, ticks=2)  # "150.25" side by side met with 3
 
     @classmethod
     def _of(cls, number: Int, label: str, low: float, high: float) -> Along:
@@ -182,7 +184,7 @@ def _image(ax: Axes, shown: Float, along: Along, **colours: Any) -> Any:
     extent = (*along.ends, len(shown) - 0.5, -0.5)
     ax.set_facecolor(NOTHING)
     drawn = ax.imshow(shown, aspect="auto", extent=extent, interpolation="none", **colours)
-    ax.xaxis.set_major_locator(MaxNLocator(4))
+    ax.xaxis.set_major_locator(MaxNLocator(along.ticks))
     return drawn
 
 
