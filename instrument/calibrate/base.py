@@ -140,7 +140,8 @@ class Solution:
         good = int(self.converged.sum())
         known = self.residual[np.isfinite(self.residual)]  # none where there was nothing to solve
         left = f"{np.median(known):.1e}" if known.size else "unknown"
-        looser = f" (more in {len(self.looser)} intervals)" if self.looser else ""
+        more = sum(g.loose > self.gauge.loose for g in self.looser.values())
+        looser = f" (more in {more} intervals)" if more else ""
         return "; ".join(
             (
                 f"{good} of {times * channels} intervals converged, {np.median(self.iterations):.0f} iterations "

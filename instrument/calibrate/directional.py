@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Annotated, Any, Literal, overload
 
 import numpy as np
 from pydantic import BeforeValidator
 
-from instrument.calibrate.base import Calibrator, Solution, by_baseline, pair
-from instrument.calibrate.clusters import Block, Limits
+from instrument.calibrate.base import Calibrator, Solution, pair
+from instrument.calibrate.directional_job import Grid, Job, near_one
 from instrument.calibrate.directional_solution import DirectionalSolution, Models
-from instrument.calibrate.gauge import gauge_of
 from instrument.checked import checked
-from instrument.errors import InputError, Outcome, did_you_mean
+from instrument.errors import InputError, did_you_mean
 from instrument.jones.base import JonesTerm
-from instrument.jones.table import JonesTable
 from instrument.predict.threads import ONE_THREAD, look_again
-from instrument.units import Bool, Complex, Count, Float, Int, Metres, Positive, PositiveSeconds, Real, to_si
+from instrument.units import Count, Float, Metres, Positive, PositiveSeconds, Real, to_si
 from instrument.visibilities import Visibilities
 
 ALL = "all"  # the cluster of a model that is not in parts
@@ -46,9 +42,11 @@ class DirectionalCal(Calibrator):
     others for some. `robust` is the degrees of freedom of Student's t: visibilities with outliers (interference,
     sources that no model has) then weigh (nu + 8) / (nu + |r|^2 / sigma^2), sigma being measured; None: Gaussian noise.
     `min_baseline` leaves out shorter ones. `start` is a term to start all clusters from, a `SelfCal` solution say; the
-    identity otherwise. Stops when no matrix changes by more than `tolerance` of itself. A fit that leaves more than
-    `unexplained` of the rms of the data is `Outcome.POOR_FIT`. Memory: each baseline twice, for every cluster and the
-    data, in every thread.
+    identity otherwise. Stops when no matrix changes by more than `tolerance` of itself, and the data could gain no more
+    than that of their rms. A fit that leaves more than `unexplained` of the rms of the data is `Outcome.POOR_FIT`.
+    Matrices common to all stations that noise would fill, because only the polarization that a beam adds shows them,
+    are held near the start by a prior that vanishes without noise (`Gauge.weak`, `Solution.common_error`). Memory: each
+    baseline twice, for every cluster and the data, in every thread.
     """
 
     pattern: Literal["full", "diagonal", "scalar", "phase"] = "full"
@@ -86,12 +84,12 @@ class DirectionalCal(Calibrator):
         for name, model in zip(names, stacked, strict=True):
             if not np.any(model):
                 raise InputError(f"the model of cluster '{name}' is zero everywhere: leave it out")
-        grid = _Grid.of(data, [self._seconds(name) for name in names])
+        grid = Grid.of(data, [self._seconds(name) for name in names])
         if self.channels > data.data.shape[1]:
             raise InputError(f"channels = {self.channels} of one solution, but the data have {data.data.shape[1]}")
         cells = [(int(k), f) for k in grid.blocks for f in range(0, data.data.shape[1], self.channels)]
-        scale = [_near(x) for x in (data.data[..., None], stacked[..., None], weight)]
-        job = _Job(self, data, stacked, weight, grid, scale)
+        scale = [near_one(x) for x in (data.data[..., None], stacked[..., None], weight)]
+        job = Job(self, data, stacked, weight, grid, scale)
         look_again()
         with ONE_THREAD, ThreadPoolExecutor(os.cpu_count() or 1) as pool:
             parts = list(pool.map(lambda cell: job.solve(*cell), cells))
@@ -119,170 +117,3 @@ class DirectionalCal(Calibrator):
         if self.min_baseline is None:
             return weight
         return weight * (np.linalg.norm(data.uvw_m, axis=-1)[:, None] >= self.min_baseline)
-
-
-@dataclass(frozen=True)
-class _Grid:
-    """Integrations counted on a regular grid (gaps count too), and the lengths of all that is made of them."""
-
-    number: Int  # (T,) of the integration, from 0
-    steps: list[int]  # integrations in the interval of each cluster
-    whole: int  # in a block: all clusters begin a new interval with it
-    piece: int  # in a piece: no cluster begins a new interval within it
-    first_s: float
-    interval_s: float
-
-    @classmethod
-    def of(cls, data: Visibilities, seconds: Iterable[float | None]) -> _Grid:
-        slots = data.at.slots_s
-        if np.any(np.diff(slots) <= 0) or np.any(np.diff(data.at.freq_hz) <= 0):
-            raise InputError("a solve needs times and channels in ascending order")
-        number = np.round((slots - slots[0]) / data.integration_s).astype(int)
-        span = int(number[-1]) + 1
-        steps = [1 if s is None else min(span, max(1, round(s / data.integration_s))) for s in seconds]
-        return cls(number, steps, math.lcm(*steps), math.gcd(*steps), float(slots[0]), data.integration_s)
-
-    @property
-    def blocks(self) -> Int:
-        """Numbers of the blocks that hold data."""
-        return np.unique(self.number // self.whole)
-
-    def known(self, cluster: int) -> Int:
-        """Numbers of the intervals of a cluster that hold data."""
-        return np.unique(self.number // self.steps[cluster])
-
-    def centres_s(self, cluster: int) -> Float:
-        """Centres of those intervals as if they were full: every integration is then nearest to its own."""
-        step = self.steps[cluster]
-        return np.asarray(self.first_s + (self.known(cluster) * step + (step - 1) / 2) * self.interval_s, float)
-
-
-@dataclass
-class _Part:
-    """What came out of one block of K unknown matrices a station and P pieces."""
-
-    cell: tuple[int, int]
-    jones: Complex
-    outcome: list[Outcome]  # (K,)
-    count: int
-    share: Float
-    history: Float
-    column: Int  # (P, C): the unknown that a cluster has in a piece
-    pieces: Int  # (P, C): the interval of the cluster that it belongs to
-    suspects: list[tuple[Int, slice, Bool]]  # times, channels and which visibilities of them stand out
-
-
-@dataclass
-class _Job:
-    """What all blocks of one solve share."""
-
-    settings: DirectionalCal
-    data: Visibilities
-    models: Complex
-    weight: Float
-    grid: _Grid
-    scale: list[float]  # of data, models and weights: what 1e170 Jy are divided by, since its square is infinite
-
-    def solve(self, block: int, channel: int) -> _Part:
-        """Solve one block of integrations, and `channels` channels from `channel` on."""
-        s, grid = self.settings, self.grid
-        rows = np.flatnonzero(grid.number // grid.whole == block)
-        pieces, place = np.unique(grid.number[rows] // grid.piece, return_inverse=True)
-        chosen = [rows[place == k] for k in range(len(pieces))]
-        span = slice(channel, min(channel + s.channels, self.data.data.shape[1]))
-        first = np.stack([pieces * grid.piece // step for step in grid.steps], axis=1)
-        column, offset = np.zeros_like(first), 0
-        for c in range(first.shape[1]):
-            column[:, c] = np.unique(first[:, c], return_inverse=True)[1] + offset
-            offset = int(column[:, c].max(initial=-1)) + 1
-        limits = Limits(s.pattern, s.tolerance, s.iterations, s.robust, s.unexplained)
-        # [piece][time, channel] as samples of pieces of one length, filled up with weight zero
-        weight = _even([self.weight[t, span] for t in chosen])
-        models = np.stack([_even([m[t, span] for t in chosen]) for m in self.models])
-        finite = bool(np.isfinite(models[:, weight > 0]).all())
-        weight = weight if finite else np.zeros_like(weight)
-        of_data, of_models, of_weight = self.scale
-        root = math.sqrt(of_data) / math.sqrt(of_models)
-        with np.errstate(invalid="ignore"):  # data may hold infinities
-            data = _even([self.data.data[t, span] for t in chosen]) / of_data
-        solver = Block(
-            data=data,
-            models=np.asarray(np.where(np.isfinite(models), models, 0.0) / of_models, complex),
-            weight=weight / of_weight, a1=self.data.antenna1, a2=self.data.antenna2, stations=len(self.data.layout),
-            column=column, limits=limits,
-        )  # fmt: skip
-        begin = self._start(rows[:1], span, solver.columns)
-        jones, outcome, count, share, history = solver.solve(begin)
-        suspects: list[tuple[Int, slice, Bool]] = []
-        if outcome is Outcome.POOR_FIT and s.robust is None:
-            shape = (-1, span.stop - span.start, weight.shape[2])
-            for t, mask in zip(chosen, solver.suspects(begin), strict=True):
-                suspects.append((t, span, mask.reshape(shape)[: len(t)]))
-        alive = [Outcome.REFUSED if finite else Outcome.NON_FINITE, outcome]
-        outcomes = [alive[int(row.any())] for row in solver.active]
-        return _Part((block, channel), jones * root, outcomes, count, share, history, column, first, suspects)
-
-    def _start(self, row: Int, span: slice, columns: int) -> Complex:
-        begin = np.zeros((columns, len(self.data.layout), 2, 2), complex)
-        begin[...] = np.eye(2)
-        if self.settings.start is not None and len(row):
-            at = self.data.at.block(slice(row[0], row[0] + 1), slice(span.start, span.start + 1))
-            given = np.broadcast_to(self.settings.start.jones(at)[0, 0, :, 0], begin.shape)
-            begin = np.where(np.isfinite(given).all(axis=(-2, -1), keepdims=True), given, begin)
-        return begin
-
-    def gathered(self, cluster: int, parts: list[_Part], suspects: Bool) -> Solution:
-        """The solution of one cluster; `suspects` (T, F, B) are those of all, (1, 1, 1) where there are none."""
-        data, settings, freqs = self.data, self.settings, self.data.at.freq_hz
-        known = self.grid.known(cluster)
-        firsts = np.arange(0, len(freqs), settings.channels)
-        shape = (len(known), len(firsts))
-        jones = np.full((*shape, len(data.layout), 2, 2), np.nan + 0j)
-        outcome: Any = np.full(shape, Outcome.REFUSED, object)
-        count = np.zeros(shape, int)
-        share = np.full(shape, np.nan)
-        for part in parts:
-            f = part.cell[1] // settings.channels
-            for own in np.unique(part.pieces[:, cluster]):
-                here = np.flatnonzero(part.pieces[:, cluster] == own)
-                k = int(part.column[here[0], cluster])
-                t = int(np.searchsorted(known, own))
-                count[t, f], share[t, f] = part.count, np.sqrt(np.mean(part.share[here] ** 2))
-                outcome[t, f] = part.outcome[k]
-                if part.outcome[k] is Outcome.CONVERGED:
-                    jones[t, f] = part.jones[k]
-        longest = max(len(p.history) for p in parts)
-        history = np.stack([np.pad(p.history, (0, longest - len(p.history))) for p in parts]).max(axis=0)
-        return Solution(
-            term=JonesTable(
-                values=jones,
-                slots_s=self.grid.centres_s(cluster),
-                freq_hz=freqs[firsts] + (freqs[: settings.channels] - freqs[0]).mean(),
-                stations=tuple(data.layout.names),
-            ),
-            outcome=outcome,
-            iterations=count,
-            residual=share,
-            gauge=gauge_of(self.models[cluster], self.weight, settings.pattern),
-            history=history,
-            interval_s=self.grid.steps[cluster] * data.integration_s,
-            suspects=suspects,
-            spoilt=by_baseline(suspects, data),
-            unexplained=share,
-        )
-
-
-def _even(pieces: list[Any]) -> Any:
-    """Arrays (t, f, ...) as one (P, s, ...), the short ones filled up with zeros."""
-    flat = [piece.reshape(-1, *piece.shape[2:]) for piece in pieces]
-    out = np.zeros((len(flat), max(len(x) for x in flat), *flat[0].shape[1:]), flat[0].dtype)
-    for row, x in zip(out, flat, strict=True):
-        row[: len(x)] = x
-    return out
-
-
-def _near(values: Any) -> float:
-    """A power of four by which values are divided to be near 1; 1.0 where their squares are no trouble."""
-    size = np.abs(values.view(float) if np.iscomplexobj(values) else values)
-    power = int(np.frexp(size.max(initial=0.0, where=np.isfinite(size)))[1]) // 2 * 2
-    return float(np.ldexp(1.0, power)) if abs(power) > 200 and power > -1000 else 1.0

@@ -42,6 +42,11 @@ class Gauge:
         return len(self.generators)
 
     @property
+    def loose(self) -> int:
+        """Number of those, and of the directions that are weak."""
+        return len(self.generators) + len(self.weak)
+
+    @property
     def unitary(self) -> bool:
         """Whether all of its X are unitary (they are for an unpolarized model)."""
         return bool(np.abs(self.generators + np.conj(np.swapaxes(self.generators, 1, 2))).max(initial=0.0) < 1e-9)
