@@ -18,8 +18,11 @@ DIRECTION = {"QuantumUnits": ["rad", "rad"], "MEASINFO": {"type": "direction", "
 KINDS = {"i": ("int", 0), "f": ("double", 0.0), "b": ("bool", False)}
 
 
-def make_ms(path, lofar, observation, columns=("DATA",)):
-    """Write the set at `path`, `columns` zero and weights 1; rows in time order, then in that of `layout.baselines`."""
+def make_ms(path, lofar, observation, columns=("DATA",), turned=False):
+    """Write the set at `path`, `columns` zero and weights 1; rows in time order, then in that of `layout.baselines`.
+
+    `turned` makes UVW position of ANTENNA1 minus ANTENNA2: the sign with which DP3's fringes agree with its beams.
+    """
     path, layout, centre = str(path), lofar.layout(), observation.phase_centre
     count, channels, interval = len(layout), len(observation.freq_hz), observation.interval
     times = observation.times(layout)
@@ -34,7 +37,7 @@ def make_ms(path, lofar, observation, columns=("DATA",)):
             {
                 "ANTENNA1": np.tile(a, len(slots)).astype(np.int32),
                 "ANTENNA2": np.tile(b, len(slots)).astype(np.int32),
-                "UVW": (at.uvw_m[:, b] - at.uvw_m[:, a]).reshape(-1, 3),
+                "UVW": (at.uvw_m[:, b] - at.uvw_m[:, a]).reshape(-1, 3) * (-1 if turned else 1),
                 **dict.fromkeys(("TIME", "TIME_CENTROID"), np.repeat(slots, len(a))),
                 **dict.fromkeys(("INTERVAL", "EXPOSURE"), np.full(rows, interval)),
                 **dict.fromkeys(("WEIGHT", "SIGMA"), np.ones((rows, 4), np.float32)),
