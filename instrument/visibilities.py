@@ -294,8 +294,8 @@ class Visibilities(VisibilitySet):
         beams, there = instrument.chain().beams(), self.beam_state.beams
         if there is not None and there.terms and self.beam_state.removed == "nothing" and there != beams:
             raise BeamStateError(
-                "the beam of this instrument is not the beam in the data; to take it out on purpose: "
-                "corrected(Towards(chain=...))"
+                "the beam of this instrument is not the beam in the data: another element, pointing or phase; to "
+                "take it out on purpose: corrected(Towards(chain=...))"
             )
         return self.corrected(Towards(chain=beams))
 
