@@ -181,6 +181,23 @@ def test_fluxes_are_those_of_each_stokes_parameter_with_its_own_weights():
     assert np.abs(found.stokes_jy - ForcedPhotometry().measure(vis, SKY).stokes_jy).max() > 1e-3
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_an_axis_of_length_1_means_that_all_along_it_are_alike(seed):
+    rng, vis = np.random.default_rng(seed), seen()
+    shapes = [tuple(n if rng.uniform() < 0.5 else 1 for n in vis.data.shape) for _ in range(2)]
+    weight, flag = rng.uniform(0.2, 2, (*shapes[0][:3], 2, 2)), rng.uniform(size=shapes[1][: 5 if seed else 3]) < 0.2
+    some = spoilt(vis, rng.uniform(size=vis.data.shape) < 0.02)
+    short, whole = some.weighted(weight).flagged(flag), np.ones(vis.data.shape)
+    long = some.weighted(weight * whole).flagged((flag if seed else flag[..., None, None]) & (whole > 0))
+    term = Chain(GainTerm(rms=0.2, seed=1), FeedTerm(rms=0.2, seed=2))
+    for change in (lambda v: v, lambda v: v.corrected(term), lambda v: v.averaged(time=2 * u.hour, channels=2)):
+        one, other = change(short), change(long)
+        assert np.abs(one.stokes_weight - other.stokes_weight).max() < 1e-13
+        known = other.effective_weight > 0
+        assert known.any()
+        assert np.abs(np.where(known, one.data, 0) - np.where(known, other.data, 0)).max() < 1e-13
+
+
 def test_corrections_keep_what_is_not_known_out_of_what_is():
     """A diagonal matrix leaves a flagged correlation where it is; a full one flags all that it reaches."""
     vis = seen()
