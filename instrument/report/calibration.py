@@ -56,7 +56,8 @@ def outcomes(solution: Solution, ax: Axes | None = None) -> Axes:
     if channels == 1:
         ax.set_yticks([])
     else:
-        ax.set_ylabel("frequency (MHz)")
+        ax.set_ylabel(up.label)
+        ax.ticklabel_format(axis="y", useOffset=False)
     counts = [(name, colour, int((solution.outcome == o).sum())) for o, name, colour in ENDED]
     keys = [Patch(color=colour, label=f"{name} ({count})") for name, colour, count in counts if count]
     ax.legend(handles=keys, frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderpad=0.2)

@@ -185,6 +185,7 @@ def _image(ax: Axes, shown: Float, along: Along, **colours: Any) -> Any:
     ax.set_facecolor(NOTHING)
     drawn = ax.imshow(shown, aspect="auto", extent=extent, interpolation="none", **colours)
     ax.xaxis.set_major_locator(MaxNLocator(along.ticks))
+    ax.ticklabel_format(axis="x", useOffset=False)  # "+1.5e2" MHz says nothing
     return drawn
 
 

@@ -103,6 +103,12 @@ def test_one_interval_shows_how_stations_differ():
     assert amplitude.shape == (4, 1) and np.ptp(amplitude) > 1  # %; over its own median each would be 0
 
 
+def test_frequencies_are_written_out_however_near_they_are():
+    axes = stations.bandpass(made(times=1, count=2, channels=2)).axes[2]
+    axes.figure.draw_without_rendering()
+    assert [float(t.get_text()) > 149 for t in axes.get_xticklabels()] and not axes.xaxis.get_offset_text().get_text()
+
+
 def test_common_errors_break_at_gaps_and_name_what_is_free():
     ax = calibration.common_errors(made(times=4, count=2, slots=[0, 1, 6, 7]))
     assert [t.get_text() for t in ax.get_legend().get_texts()] == [
