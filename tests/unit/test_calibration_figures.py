@@ -106,7 +106,8 @@ def test_one_interval_shows_how_stations_differ():
 def test_frequencies_are_written_out_however_near_they_are():
     axes = stations.bandpass(made(times=1, count=2, channels=2)).axes[2]
     axes.figure.draw_without_rendering()
-    assert [float(t.get_text()) > 149 for t in axes.get_xticklabels()] and not axes.xaxis.get_offset_text().get_text()
+    assert all(t.get_text()[:3] in ("149", "150") for t in axes.get_xticklabels())
+    assert axes.xaxis.get_offset_text().get_text() == ""
 
 
 def test_common_errors_break_at_gaps_and_name_what_is_free():
