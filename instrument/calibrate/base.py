@@ -15,6 +15,7 @@ from instrument.calibrate.fit import doubts
 from instrument.calibrate.gauge import Gauge
 from instrument.checked import checked
 from instrument.component import Component
+from instrument.correlations import APART
 from instrument.errors import InputError, InstrumentError, Outcome
 from instrument.jones.base import JonesTerm
 from instrument.jones.chain import Chain
@@ -198,6 +199,18 @@ def pair(data: Visibilities, model: Visibilities) -> tuple[Complex, Complex, Flo
     data.check_same(model)
     weight = np.broadcast_to(data.whole_weight, data.data.shape[:3])
     return data.data, model.data, weight
+
+
+def partly_known(data: Visibilities) -> tuple[str, ...]:
+    """A sentence where single correlations are flagged or not finite: a solve leaves all four out (see `pair`)."""
+    weight = data.effective_weight
+    if weight.ndim < APART:
+        return ()
+    known = (weight > 0).sum(axis=(-2, -1))
+    lost, there = int(((known > 0) & (known < 4)).sum()), int((known > 0).sum())
+    if not lost:
+        return ()
+    return (f"{100 * lost / there:.2g} % of the visibilities are left out: not all of their correlations are known",)
 
 
 def other_length(found: Intervals, asked_s: float | None) -> tuple[str, ...]:

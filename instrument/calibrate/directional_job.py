@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from instrument.calibrate.base import Solution, by_baseline
+from instrument.calibrate.base import Solution, by_baseline, partly_known
 from instrument.calibrate.cluster_data import Block, Limits
 from instrument.calibrate.clusters import Found, solved, suspects
 from instrument.calibrate.gauge import GENERATORS, Gauge, gauge_of
@@ -211,7 +211,7 @@ class Job:
             unexplained=share,
             error=error,
             common_error=common,
-            notes=_faint(error, outcome == Outcome.CONVERGED, settings.pattern),
+            notes=(*_faint(error, outcome == Outcome.CONVERGED, settings.pattern), *partly_known(data)),
         )
 
 

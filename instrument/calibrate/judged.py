@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 
 from instrument import mat2
-from instrument.calibrate.base import Calibrator, Solution, other_length, pair
+from instrument.calibrate.base import Calibrator, Solution, other_length, pair, partly_known
 from instrument.calibrate.fit import Left, strange
 from instrument.calibrate.gauge import UNKNOWNS, gauge_of
 from instrument.calibrate.graph import counted, tied
@@ -86,7 +86,7 @@ def judged(
         history=history,
         interval_s=times.length_s,
         unexplained=left.worst.reshape(shape) * np.median(spread, axis=-1) ** 2,
-        notes=other_length(times, interval_s),
+        notes=(*other_length(times, interval_s), *partly_known(data)),
     )
 
 
