@@ -107,6 +107,20 @@ def what_is_flagged_is_not_seen(imager: AnyImager) -> str:
     return ""
 
 
+def a_flagged_correlation_is_not_seen_and_spoils_no_other(imager: AnyImager) -> str:
+    """pq of NaN, flagged by itself, leaves U and V of the other integrations, and I and Q of these or of all."""
+    whole = _seen((1.0, 0.5, -0.25, 0.125), 5, 3, float(imager.pixel))
+    flag = np.zeros(whole.data.shape, bool)
+    flag[:2, ..., 0, 1] = True
+    found = _planes(imager, whole.with_data(np.where(flag, np.nan, whole.data)).flagged(flag)).data
+    rest, every = (_planes(imager, v).data for v in (whole.block(slice(2, None), slice(None)), whole))
+    # an imager may leave out the visibility, or have a weight for each Stokes parameter (`chosen`, `chosen_stokes`)
+    parallel = min(float(np.abs((found - due)[:, :2]).max()) for due in (rest, every))
+    apart = max(parallel, float(np.abs((found - rest)[:, 2:]).max()))
+    demand(apart <= 1e-3, f"it changes the image by {apart:.1e}")
+    return ""
+
+
 def baselines_outside_its_uv_range_are_not_seen(imager: AnyImager) -> str:
     """With a uv range the image is that of the baselines within it."""
     whole = _seen((1.0, 0.5, 0.0, 0.0), 5, 3, float(imager.pixel))
@@ -133,6 +147,7 @@ CLAIMS = (
     east_is_left_and_north_is_up,
     blocks_give_the_image_of_the_whole,
     what_is_flagged_is_not_seen,
+    a_flagged_correlation_is_not_seen_and_spoils_no_other,
     baselines_outside_its_uv_range_are_not_seen,
     a_call_of_image_has_no_side_effects,
 )

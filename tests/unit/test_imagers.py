@@ -95,6 +95,7 @@ def test_what_only_gives_dirty_images_keeps_the_contract_blocks_and_all():
         (Smaller, imagers.its_cube_is_channels_4_pixels_pixels_about_the_phase_centre),
         (FirstBlock, imagers.blocks_give_the_image_of_the_whole),
         (SeesFlagged, imagers.what_is_flagged_is_not_seen),
+        (SeesFlagged, imagers.a_flagged_correlation_is_not_seen_and_spoils_no_other),
         (Everything, imagers.baselines_outside_its_uv_range_are_not_seen),
         (Remembers, imagers.a_call_of_image_has_no_side_effects),
     ],
