@@ -22,16 +22,16 @@ def solution_figures(solution: Solution, draw: Callable[..., FigureEntry]) -> li
     """
     several = "; of several in one column the worst is shown" if max(solution.outcome.shape) > COLUMNS else ""
     entries = [draw("outcomes", outcomes(solution), f"How the solve of every interval ended{several}; grey: no data.")]
+    middle = solution.jones.shape[1] // 2
+    where = f" at {solution.term.freq_hz[middle] / 1e6:.6g} MHz" if middle else ""
     if np.isfinite(solution.jones).any():
-        middle = solution.jones.shape[1] // 2
-        where = f" at {solution.term.freq_hz[middle] / 1e6:.6g} MHz" if middle else ""
         text = f"Solved gains of every station{where}: amplitude over its median, less 1, and phase; grey: none."
         entries.append(draw("gains", gains(solution, middle), text))
         if middle:
             text = "The same against frequency, in the interval with most solutions."
             entries.append(draw("bandpass", bandpass(solution), text))
         if np.isfinite(solution.error).any():
-            text = "Standard errors of the gains that noise makes: rms of the four elements of a matrix."
+            text = f"Standard errors of the gains{where} that noise makes: rms of the four elements of a matrix."
             entries.append(draw("gain_errors", gain_errors(solution, middle), text))
         if not np.isnan(solution.common_error).all():
             text = "Standard errors of what all stations have in common, the largest first; triangles: free."
@@ -39,6 +39,6 @@ def solution_figures(solution: Solution, draw: Callable[..., FigureEntry]) -> li
     if (solution.history > 0).any():
         entries.append(draw("convergence", convergence(solution), "How the solve converged: the slowest interval."))
     if np.isfinite(solution.residual).any():
-        text = "What the solutions leave of the data they were solved from."
-        entries.append(draw("residual", residuals(solution), text))
+        text = f"What the solutions leave of the data they were solved from{where}."
+        entries.append(draw("residual", residuals(solution, middle), text))
     return entries
