@@ -101,6 +101,12 @@ def test_coordinates_of_an_average_are_those_of_an_observation_at_its_mean_times
     given = replace(vis, given_uvw_m=vis.uvw_m).averaged(time=60 * u.s, channels=3)
     assert np.abs(given.uvw_m - due.uvw_m).max() < 1e-6
     assert given.beam_state is vis.beam_state
+    # and so do directions of another program
+    at = replace(vis.at, seen=vis.at.itrf, seen_east=vis.at.east_itrf, seen_centre=vis.at.centre_itrf)
+    other = replace(vis, at=at).averaged(time=60 * u.s, channels=3).at
+    for name in ("itrf", "east_itrf", "centre_itrf"):
+        assert np.abs(getattr(other, name) - getattr(found.at, name)).max() < 1e-10
+    assert other.seen is not None and other.seen_centre is not None
 
 
 def test_an_average_of_one_is_what_it_was_and_gaps_are_not_filled():
