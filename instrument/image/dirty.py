@@ -146,8 +146,8 @@ class Images(ImageSums):
         if most > 1 or channel.crossed is not None:
             channel.crossed = images[4].copy() if channel.crossed is None else channel.crossed  # alike until now
             images, columns = [*images, channel.crossed], [*columns, columns[-1]]
-        weights = np.broadcast_to(weight, (len(weight), 4)).T[[0, 1, 2, 3, 0, 2][: len(images)]]
-        for image, values, each in zip(images, columns, weights, strict=True):
+        weights = np.broadcast_to(weight, (len(weight), 4)).T
+        for image, values, k in zip(images, columns, (0, 1, 2, 3, 0, 2), strict=False):
             if not values.any():  # a Stokes parameter that is exactly zero
                 continue
             # ducc0 has exp(+2 pi i (u l + v m - w (n-1))) for the adjoint: flip w; x to the west: flip u
@@ -155,7 +155,7 @@ class Images(ImageSums):
                 uvw=uvw * (LIGHT / channel.freq_hz),
                 freq=np.array([channel.freq_hz]),
                 vis=np.ascontiguousarray(values)[:, None],
-                wgt=np.ascontiguousarray(each)[:, None],
+                wgt=np.ascontiguousarray(weights[k])[:, None],
                 npix_x=self.imager.pixels,
                 npix_y=self.imager.pixels,
                 pixsize_x=self.imager.pixel,
