@@ -13,7 +13,7 @@ import numpy as np
 
 from instrument.compiled import compiled
 from instrument.phasor import FAST
-from instrument.units import Float
+from instrument.units import Complex, Float
 
 LANES = 16
 
@@ -136,3 +136,9 @@ def solve_stations(right: Float, left: Float, pattern: str) -> Any:
                 p, q = p / np.abs(p), q / np.abs(q)
             out[..., 0, 0], out[..., 1, 1] = p, q
     return out
+
+
+def power_of(values: Complex) -> Float:
+    """Sum of |x|^2 of matrices (..., 2, 2), (...); without the roots of `abs`."""
+    flat = np.ascontiguousarray(values).view(float).reshape(*values.shape[:-2], 8)
+    return np.asarray(np.einsum("...i,...i->...", flat, flat))

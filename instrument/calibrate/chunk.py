@@ -84,13 +84,13 @@ class Job:
         if hard.any():
             fit.improve(lanes, np.flatnonzero(hard), s)
         jones, poor = fit.jones, fit.left.poor(s.unexplained) | fit.odd.any(axis=1)
-        gauges, free = {}, free_counts(lanes.eigen[0], lanes.model_power)
+        gauges, free = {}, free_counts(lanes.common.eigen[0], lanes.common.model_power)
         few_samples = 8 * samples.sum(axis=1) < UNKNOWNS[s.pattern] * held.sum(axis=1) - free
         thin = (samples > 0).sum(axis=1) < 2 * held.sum(axis=1)
         outcome = []
         for k in range(len(cells)):
             if free[k] > self.gauge.count and held[k].any():
-                gauges[k] = common(lanes.form[k], float(lanes.model_power[k]), s.pattern)
+                gauges[k] = common(lanes.common.form[k], float(lanes.common.model_power[k]), s.pattern)
             ended = self._outcome(finite[k], active[k], held[k], few_samples[k], fit.step[k])
             if ended is Outcome.CONVERGED and poor[k]:
                 ended = Outcome.POOR_FIT

@@ -6,9 +6,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from instrument.calibrate.als import LANES, matrices, planar, residual, solve_stations, sweep
+from instrument.calibrate.als import LANES, matrices, planar, power_of, residual, solve_stations, sweep
+from instrument.calibrate.common import CommonPart
 from instrument.calibrate.fit import Left
-from instrument.calibrate.gauge import GENERATORS, common_form, second_moment
+from instrument.calibrate.gauge import GENERATORS
+from instrument.calibrate.newton import solved_together
 from instrument.units import Complex, Float, Int
 
 FAR = 0.3  # relative step above which sweeps are averaged instead of corrected
@@ -39,11 +41,10 @@ class Lanes:
         self.lanes = LANES if self.count > LANES // 2 else max(1, self.count)
         self.v, self.m = planar(v, self.lanes), planar(m, self.lanes)
         self.products = (v, m)
-        moment = second_moment(m)
-        self.form, self.model_power = common_form(moment, settings.pattern), np.einsum("lii->l", moment).real
-        self.eigen = np.linalg.eigh(self.form)
         self.total = power_of(v).sum(axis=1)
-        power = power_of(m).reshape(self.count, -1, len(a1)).sum(axis=1)
+        each = power_of(m)
+        self.common = CommonPart(m, self.total, active, (each > 0).sum(axis=1), settings.pattern)
+        power = each.reshape(self.count, -1, len(a1)).sum(axis=1)
         stations = active.shape[1]
         self.power = np.zeros((self.count, stations, stations))
         self.power[:, a1, a2] = power
@@ -52,6 +53,13 @@ class Lanes:
 
     def iterate(self, jones: Complex, far: float = FAR) -> tuple[Complex, Float, Int, Float]:
         """Sweeps until all lanes stand still: matrices (L, A, 2, 2), last steps, iterations, worst step of each.
+
+        Where common directions are weak, sweeps only lead near, and all stations are solved at once.
+        """
+        return solved_together(self, jones) if self.common.weak.any() else self._swept(jones, far)
+
+    def _swept(self, jones: Complex, far: float) -> tuple[Complex, Float, Int, Float]:
+        """`iterate` where all common directions are seen well or not at all.
 
         A step that made the fit worse is taken back and tried again with more damping, as Levenberg and Marquardt do.
         """
@@ -69,7 +77,7 @@ class Lanes:
         for turn in range(self.settings.iterations):
             sweep(self.v, self.m, self.a1, self.a2, planar(jones, self.lanes), right, left)
             new = solve_stations(right, left, self.settings.pattern)[: self.count]
-            cost = self._cost(jones, right, left)
+            cost = self.cost(jones, right, left)
             unsolved = self.active & ~np.isfinite(new).all(axis=(-2, -1))
             new = np.where((self.active & ~unsolved)[..., None, None], new, jones)
             # 1e-12 of the power of the data: rounding. Averaged steps far from the answer are taken as they come
@@ -77,7 +85,7 @@ class Lanes:
             keep = worse[:, None, None, None]
             best, best_new = np.where(keep, best, jones), np.where(keep, best_new, new)
             best_cost = np.where(worse, best_cost, cost)
-            left_over = matrices(right)[: self.count] - jones @ self._normal(left)
+            left_over = matrices(right)[: self.count] - jones @ self.normal(left)
             best_left = np.where(keep, best_left, left_over)
             moved = np.any(step > 0.1) or (turn % 8 == 0 and np.any(step > 1e-3))
             if coupling is None or moved or np.any(damping != of):
@@ -102,7 +110,7 @@ class Lanes:
         size = np.sqrt(power_of(new))
         return _relative(new - old, size, 1e-12 * size.max(axis=1, keepdims=True))
 
-    def _cost(self, jones: Complex, right: Float, left: Float) -> Float:
+    def cost(self, jones: Complex, right: Float, left: Float) -> Float:
         """Power of V - J_a M J_b^H over that of V in each lane, from the sums of a sweep: no pass over the data."""
         n = matrices(right)[: self.count]
         d00, d11, re, im = np.moveaxis(left, 1, 0).transpose(0, 2, 1)[:, : self.count]
@@ -138,7 +146,7 @@ class Lanes:
         gain = weight.sum(axis=(1, 2)) / np.maximum(4 * self.power.sum(axis=(1, 2)), 1e-300) * (1 + damping)
         return plus * scale, minus * scale, share, gain
 
-    def _normal(self, left: Float) -> Complex:
+    def normal(self, left: Float) -> Complex:
         """sum Z Z^H of each station (L, A, 2, 2)."""
         d00, d11, re, im = np.moveaxis(left, 1, 0).transpose(0, 2, 1)[:, : self.count]
         return np.stack([np.stack([d00 + 0j, re + 1j * im], -1), np.stack([re - 1j * im, d11 + 0j], -1)], -2)
@@ -147,7 +155,7 @@ class Lanes:
         """Step G (L, 2, 2) of J_a (1 + G), the same for all stations: a few parameters that sweeps find slowly."""
         generators = GENERATORS[self.settings.pattern]
         gradient = np.einsum("nij,laki,lakj->ln", generators.conj(), old.conj(), left_over).real
-        values, vectors = self.eigen
+        values, vectors = self.common.eigen
         # what the model does not see is the gauge: it stays where it is
         seen = values > 1e-9 * np.maximum(values[:, -1:], 1e-300)
         scale = np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0) / np.maximum(gain, 1e-300)[:, None]
@@ -210,12 +218,6 @@ class Lanes:
         residual(self.v, self.m, self.a1, self.a2, planar(jones, self.lanes), out)
         rest, data, fit = np.moveaxis(out[..., : self.count], 2, 1)
         return Left(rest, data, fit, samples)
-
-
-def power_of(values: Complex) -> Float:
-    """Sum of |x|^2 of matrices (..., 2, 2), (...); without the roots of `abs`."""
-    flat = np.ascontiguousarray(values).view(float).reshape(*values.shape[:-2], 8)
-    return np.asarray(np.einsum("...i,...i->...", flat, flat))
 
 
 def levels(v: Complex, m: Complex, a1: Int, a2: Int, stations: int, robust: bool = False) -> Float:

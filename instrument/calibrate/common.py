@@ -1,0 +1,79 @@
+"""What all stations have in common: the few directions J_a exp(G) that data see hardly at all, and a prior on them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from instrument import mat2
+from instrument.calibrate.gauge import BLIND, GENERATORS, UNKNOWNS, common_form, second_moment
+from instrument.units import Bool, Complex, Float, Int
+
+HELD_TO = 0.3  # standard deviation of the prior on a common direction, about the start: errors of receivers are smaller
+WEAK = 1e-3  # share of the model's power below which sweeps and averages do not find a common direction
+
+
+class CommonPart:
+    """Common matrices exp(sum_k y_k G_k) of some lanes (L), for stations (L, A) that are tied, samples (L,) that count.
+
+    Through beams the data see some of them with 1e-8 of their power: a step J (1 + y G) leaves the data by y², of which
+    they see more than of y itself, and noise moves y without end. So steps are exponentials, and y, the least-squares
+    projection of J - J_start onto J_start G, has a prior of standard deviation `HELD_TO`. Its weight s² / `HELD_TO`² is
+    taken from what is left of the data, s² per real number: without noise there is no prior.
+    """
+
+    def __init__(self, model: Complex, total: Float, active: Bool, samples: Int, pattern: str) -> None:
+        moment = second_moment(model)
+        self.generators = GENERATORS[pattern]
+        self.form, self.model_power = common_form(moment, pattern), np.einsum("lii->l", moment).real
+        self.eigen = np.linalg.eigh(self.form)
+        self.active = active
+        self.total = np.maximum(total, 1e-300)
+        self.unknowns = UNKNOWNS[pattern] * active.sum(axis=1)
+        self.freedom = np.maximum(8 * samples - self.unknowns, 1)
+        power = np.where(self.model_power > 0, self.model_power, 1.0)[:, None]
+        self.free, below = self.eigen[0] <= BLIND * power, self.eigen[0] <= WEAK * power
+        self.weak = below & ~self.free
+
+    def begin(self, start: Complex) -> None:
+        """Hold the common directions near matrices (L, A, 2, 2)."""
+        self.start = start.copy()
+        self.tangents = np.einsum("laij,njk->lnaik", start, self.generators)
+        flat = self.tangents.reshape(*self.form.shape[:2], -1)
+        gram = (flat.conj() @ np.swapaxes(flat, 1, 2)).real
+        size = np.maximum(np.trace(gram, axis1=1, axis2=2), 1e-300)[:, None, None]
+        self.back = np.linalg.inv(gram / size + 1e-12 * np.eye(gram.shape[1])) / size
+        self.weight = np.full(len(start), np.inf)
+
+    def moved(self, lane: int, jones: Complex) -> Float:
+        """How far matrices (A, 2, 2) of a lane have gone from the start along each common direction, y (n,)."""
+        apart = (self.tangents[lane].conj() * (jones - self.start[lane])).real.sum(axis=(1, 2, 3))
+        return np.asarray(self.back[lane] @ apart)
+
+    def moves(self, lane: int, jones: Complex) -> Float:
+        """What steps J_a exp(e_a) of matrices (A, 2, 2) do to `moved` of a lane, (n, 8 A): re, im of e00, e01, e10, e11."""
+        each = np.einsum("naik,aij->najk", self.tangents[lane].conj(), jones)
+        return self.back[lane] @ np.stack([each.real, -each.imag], axis=-1).reshape(len(each), -1)
+
+    def weigh(self, lane: int, share: float) -> float:
+        """The weight of the prior of a lane, lowered to what a share of the power of the data that is left makes of it."""
+        found = max(share, 0.0) * self.total[lane] / self.freedom[lane] / HELD_TO**2
+        self.weight[lane] = min(self.weight[lane], found)
+        return float(self.weight[lane])
+
+    def seen(self, lane: int, step: Complex) -> Complex:
+        """Steps e (A, 2, 2) of a lane without what is common to all along directions that the data hardly see."""
+        use = self.active[lane]
+        mean = step[use].mean(axis=0) if use.any() else np.zeros((2, 2))
+        hidden = self.eigen[1][lane][:, self.weak[lane] | self.free[lane]]
+        y = np.einsum("nij,ij->n", self.generators.conj(), mean).real / 2
+        return step - np.einsum("n,nij->ij", hidden @ (hidden.T @ y), self.generators)
+
+
+def exponential(matrix: Complex) -> Complex:
+    """exp of matrices (..., 2, 2) in closed form: exp(t) (cosh(d) 1 + sinh(d) / d H), t half the trace, H the rest."""
+    half = (matrix[..., 0, 0] + matrix[..., 1, 1]) / 2
+    rest = matrix - half[..., None, None] * mat2.IDENTITY
+    d = np.sqrt(-mat2.det(rest) + 0j)
+    far = np.abs(d) > 1e-5
+    ratio = np.where(far, np.sinh(d) / np.where(far, d, 1.0), 1 + d * d / 6)
+    return np.asarray(np.exp(half)[..., None, None] * (np.cosh(d)[..., None, None] * mat2.IDENTITY + ratio[..., None, None] * rest))
