@@ -46,6 +46,8 @@ class Part:
     history: Float
     gauges: dict[int, Gauge]
     suspects: dict[int, Bool]
+    error: Float
+    common_error: Float
 
 
 @dataclass
@@ -104,8 +106,12 @@ class Job:
         # J^-1 magnifies what is left over: by its condition number for either station
         with np.errstate(invalid="ignore"):
             worst = fit.left.worst * np.median(np.where(held, mat2.condition(jones), 1.0), axis=1) ** 2
-        jones[[o is not Outcome.CONVERGED for o in outcome]] = np.nan
-        jones[~held] = np.nan
+        for k in np.flatnonzero(hard):
+            lanes.factors.pop(int(k), None)
+        error, common_error = lanes.errors(jones, fit.left.share, self.gauge)
+        failed_lanes = [o is not Outcome.CONVERGED for o in outcome]
+        jones[failed_lanes] = error[failed_lanes] = common_error[failed_lanes] = np.nan
+        jones[~held] = error[~held] = np.nan
         named = {int(lost[k]): mask for k, mask in found.items()}
         return Part(
             jones * level[:, None, None, None],
@@ -116,6 +122,8 @@ class Job:
             history,
             gauges,
             named,
+            error * level[:, None, None, None],
+            common_error,
         )
 
     def _tied(self, v: Complex, m: Complex) -> tuple[Complex, Complex, Bool, Bool, Int]:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from instrument import mat2
-from instrument.calibrate.gauge import BLIND, GENERATORS, UNKNOWNS, common_form, second_moment
+from instrument.calibrate.gauge import BLIND, GENERATORS, HELD_TO, UNKNOWNS, common_form, second_moment
 from instrument.units import Bool, Complex, Float, Int
 
-HELD_TO = 0.3  # standard deviation of the prior on a common direction, about the start: errors of receivers are smaller
 WEAK = 1e-3  # share of the model's power below which sweeps and averages do not find a common direction
 
 

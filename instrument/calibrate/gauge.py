@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
@@ -19,6 +19,7 @@ GENERATORS: dict[str, Complex] = {
     "phase": 1j * _SIGMA[:2],
 }
 UNKNOWNS = {"full": 8, "diagonal": 4, "scalar": 2, "phase": 2}  # real numbers per station
+HELD_TO = 0.3  # standard deviation of the prior on a common direction, about the start: errors of receivers are smaller
 BLIND = 1e-12  # share of the model's power that a direction may change and still count as unseen
 
 
@@ -28,13 +29,15 @@ class Gauge:
 
     `seen` is how strongly the model constrains each common direction, relative to its power, weakest first: exactly
     zero is a gauge freedom, a small number is a direction that noise will fill. Those that noise fills beyond what a
-    solve holds near its start are `weak` (m, 2, 2): generators as well, which `nearest` turns along too.
+    solve holds near its start are `weak` (m, 2, 2): generators as well, which `nearest` turns along too. `directions`
+    (n, 2, 2) are all of them, in the order of `seen`.
     """
 
     generators: Complex
     seen: Float
     pattern: str
     weak: Complex = field(default_factory=lambda: np.zeros((0, 2, 2), complex))
+    directions: Complex = field(default_factory=lambda: np.zeros((0, 2, 2), complex))
 
     @property
     def count(self) -> int:
@@ -66,6 +69,14 @@ class Gauge:
             4: "free: a matrix common to all stations (every source of the model has the same polarization)",
         }
         return names.get(self.count, f"free: {self.count} parameters common to all stations")
+
+    def with_errors(self, error: Float, most: float = HELD_TO) -> Gauge:
+        """This gauge, weak where the standard error (..., n) of a common direction is in the median above `most`."""
+        known = np.isfinite(error).any(axis=-1)
+        if not known.any():
+            return self
+        weak = (np.median(error[known], axis=0) > most) & (np.arange(len(self.seen)) >= self.count)
+        return replace(self, weak=self.directions[weak])
 
     def nearest(self, jones: Complex, to: Complex) -> Complex:
         """The X (..., 2, 2) of this gauge that brings jones (..., A, 2, 2) nearest to `to`; NaN does not vote."""
@@ -116,7 +127,8 @@ def common(form: Float, power: float, pattern: str) -> Gauge:
     """The gauge of a `common_form` (n, n) of a model of some power, for station matrices of a pattern."""
     use = GENERATORS[pattern]
     values, vectors = np.linalg.eigh(form / (power if power > 0 else 1.0))
-    return Gauge(np.einsum("kn,kij->nij", vectors[:, values <= BLIND], use), values, pattern)
+    directions = np.einsum("kn,kij->nij", vectors, use)
+    return Gauge(directions[values <= BLIND], values, pattern, directions=directions)
 
 
 def free_counts(values: Float, powers: Float) -> Any:

@@ -8,9 +8,11 @@ import numpy as np
 
 from instrument.calibrate.als import LANES, matrices, planar, power_of, residual, solve_stations, sweep
 from instrument.calibrate.common import CommonPart
+from instrument.calibrate.errors import gain_errors
 from instrument.calibrate.fit import Left
-from instrument.calibrate.gauge import GENERATORS
+from instrument.calibrate.gauge import GENERATORS, HELD_TO, Gauge
 from instrument.calibrate.newton import solved_together
+from instrument.calibrate.normal import BASIS
 from instrument.units import Complex, Float, Int
 
 FAR = 0.3  # relative step above which sweeps are averaged instead of corrected
@@ -50,6 +52,8 @@ class Lanes:
         self.power[:, a1, a2] = power
         self.power += np.swapaxes(self.power, 1, 2)
         self.a1, self.a2, self.active, self.settings = a1, a2, active, settings
+        # of the normal matrices of lanes that were solved together, with the weights of their priors
+        self.factors: dict[int, tuple[Float, float]] = {}
 
     def iterate(self, jones: Complex, far: float = FAR) -> tuple[Complex, Float, Int, Float]:
         """Sweeps until all lanes stand still: matrices (L, A, 2, 2), last steps, iterations, worst step of each.
@@ -145,6 +149,34 @@ class Lanes:
         # how much larger a change shows in the data than in the model, the mean |J_a|^2 |J_b|^2
         gain = weight.sum(axis=(1, 2)) / np.maximum(4 * self.power.sum(axis=(1, 2)), 1e-300) * (1 + damping)
         return plus * scale, minus * scale, share, gain
+
+    def errors(self, jones: Complex, share: Float, gauge: Gauge) -> tuple[Float, Float]:
+        """Standard errors of gains (L, A, 2, 2) and of the common directions of a gauge (L, n), for what is left over.
+
+        Where all stations were solved at once, from their normal matrix; elsewhere as for a model m_ab 1: the two parts
+        of each e_a have the covariance of `_coupling`, and what is free is left out.
+        """
+        free = np.arange(len(gauge.seen)) < gauge.count
+        variance = share**2 * self.total / (self.common.freedom + gauge.count)
+        basis = BASIS[self.settings.pattern]
+        plus, minus, _, gain = self._coupling(jones, np.zeros(self.count))
+        size = power_of(jones)
+        total = (self.power * size[:, :, None] * size[:, None, :]).sum(axis=2) / 8
+        u = total / np.maximum(total.sum(axis=1, keepdims=True), 1e-300)
+        ways = [np.einsum("laa->la", plus), np.maximum(np.einsum("laa->la", minus) - u, 0.0)]
+        mean = ways[1] if self.settings.pattern == "phase" else sum(ways)
+        each = mean / (2 if self.settings.pattern == "scalar" else 1) / np.where(total > 0, total, np.nan) / 2
+        allowed = (BASIS[self.settings.pattern] != 0).any(axis=1)[::2].reshape(2, 2)
+        error = np.sqrt(each * size / 2)[..., None, None] * np.where(allowed, 1.0, 0.0)
+        along = np.einsum("kij,nij->nk", self.common.generators.conj(), gauge.directions).real / 2
+        bent = np.einsum("nk,lkm,nm->ln", along, self.common.form, along) * gain[:, None]
+        with np.errstate(divide="ignore"):
+            common = np.where(free, np.inf, 1 / np.sqrt(np.maximum(bent, 0.0)))
+        for k, (upper, weight) in self.factors.items():
+            most = HELD_TO / np.sqrt(max(variance[k], 1e-300))
+            error[k], common[k] = gain_errors(upper, jones[k], basis, gauge.directions, free, weight, most)
+        root = np.sqrt(variance)
+        return error * root[:, None, None, None], common * root[:, None]
 
     def normal(self, left: Float) -> Complex:
         """sum Z Z^H of each station (L, A, 2, 2)."""

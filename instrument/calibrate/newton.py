@@ -32,6 +32,7 @@ class Side(Protocol):
     settings: Any
     total: Float
     common: CommonPart
+    factors: dict[int, tuple[Float, float]]
 
     def cost(self, jones: Complex, right: Float, left: Float) -> Float:
         """Power left over, relative to that of the data (L,)."""
@@ -58,6 +59,7 @@ def solved_together(lanes: Side, jones: Complex) -> tuple[Complex, Float, Int, F
         history.append(float(np.nanmax(step, initial=0.0)))
         if not np.any(step > lanes.settings.tolerance):
             break
+    lanes.factors = {k: (one.factor, one.weight) for k, one in enumerate(solves) if one.factor is not None}
     return jones, step, count, np.array(history)
 
 

@@ -62,13 +62,14 @@ class SelfCal(Calibrator):
         outcome[:] = [o for p in parts for o in p.outcome]
         longest = max(len(p.history) for p in parts)
         history = np.stack([np.pad(p.history, (0, longest - len(p.history))) for p in parts]).max(axis=0)
+        common_error = np.concatenate([p.common_error for p in parts]).reshape(*shape, -1)
         suspects = _mask({i * LANES + k: x for i, p in enumerate(parts) for k, x in p.suspects.items()}, cells, data)
         return Solution(
             term=JonesTable(values=jones, slots_s=grouped.centres_s, freq_hz=freqs, stations=tuple(data.layout.names)),
             outcome=outcome.reshape(shape),
             iterations=np.concatenate([p.iterations for p in parts]).reshape(shape),
             residual=np.concatenate([p.residual for p in parts]).reshape(shape),
-            gauge=job.gauge,
+            gauge=job.gauge.with_errors(common_error),
             history=history,
             interval_s=grouped.length_s,
             looser=_by_cell({i * LANES + k: g for i, p in enumerate(parts) for k, g in p.gauges.items()}, shape),
@@ -76,6 +77,8 @@ class SelfCal(Calibrator):
             spoilt=by_baseline(suspects, data),
             unexplained=np.concatenate([p.worst for p in parts]).reshape(shape),
             notes=other_length(grouped, self.interval),
+            error=np.concatenate([p.error for p in parts]).reshape(jones.shape),
+            common_error=common_error,
         )
 
     def _cut(self, data: Visibilities, weight: Float) -> Float:

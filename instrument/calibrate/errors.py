@@ -1,0 +1,54 @@
+"""Standard errors of gains and of common directions, from the normal matrix of an interval and what is left of its data."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import lapack
+
+from instrument.units import Bool, Complex, Float
+
+
+def gain_errors(
+    upper: Float, jones: Complex, basis: Float, directions: Complex, free: Bool, weight: float, most: float
+) -> tuple[Float, Float]:
+    """Of every gain (A, 2, 2) and along common `directions` (n, 2, 2), for noise of variance 1 per real number.
+
+    upper (A k, A k) is R of the normal matrix R^T R of steps jones_a exp(e_a), jones (A, 2, 2), basis (8, k) their real
+    coordinates. That of a direction is of y in exp(sum_k y_k G_k), as the data alone have it without a prior of this
+    weight, and infinite where it is `free` (n,). That of a gain is the rms of its real and its imaginary part, without
+    what it has along directions that are free or whose error is above `most`.
+    """
+    stations, size = len(jones), basis.shape[1]
+    inverse, _ = lapack.dtrtri(upper, lower=0, overwrite_c=0)
+    rows = np.triu(inverse).reshape(stations, size, -1)
+    turn = _left(jones) @ basis  # (A, 8, k): of e to J e
+    spread = turn @ (rows @ np.swapaxes(rows, 1, 2))
+    variance = (spread * turn).sum(axis=2)
+    tangents = np.einsum("aij,njk->naik", jones, directions).reshape(len(directions), stations, 4)
+    real = np.ascontiguousarray(tangents).view(float)  # (n, A, 8)
+    right = np.einsum("nax,axk->nak", real, turn).reshape(len(directions), -1)
+    seen = lapack.dpotrs(upper, right.T, lower=0)[0].T.reshape(len(directions), stations, size)
+    along = np.einsum("nak,axk->nax", seen, turn)
+    flat, of_flat = (x.reshape(len(directions), -1) for x in (real, along))
+    both, gram = flat @ of_flat.T, flat @ flat.T
+    back = np.linalg.pinv(gram, hermitian=True)
+    common = back @ both @ back
+    own = np.maximum(np.diagonal(common), 0.0)
+    with np.errstate(divide="ignore"):
+        alone = np.where(weight * own < 1 - 1e-9, own / np.maximum(1 - weight * own, 1e-300), np.inf)
+    alone = np.where(free, np.inf, alone)
+    few = alone > most**2
+    near = np.linalg.pinv(gram[np.ix_(few, few)], hermitian=True)
+    once = np.einsum("nax,nm,max->ax", real[few], near, along[few])
+    twice = np.einsum("nax,nm,max->ax", real[few], near @ both[np.ix_(few, few)] @ near, real[few])
+    variance = np.maximum(variance - 2 * once + twice, 0.0).reshape(stations, 2, 2, 2).mean(axis=3)
+    return np.sqrt(variance), np.sqrt(alone)
+
+
+def _left(jones: Complex) -> Float:
+    """Real matrices (A, 8, 8) of e -> J e, in re and im of 00, 01, 10, 11."""
+    out = np.zeros((len(jones), 2, 2, 2, 2, 2, 2))  # i, k, part of J e; j, k, part of e
+    for k in range(2):
+        out[:, :, k, 0, :, k, 0] = out[:, :, k, 1, :, k, 1] = jones.real
+        out[:, :, k, 0, :, k, 1], out[:, :, k, 1, :, k, 0] = -jones.imag, jones.imag
+    return out.reshape(len(jones), 8, 8)
