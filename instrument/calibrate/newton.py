@@ -95,7 +95,16 @@ class _Lane:
         self.best: Any = None  # matrices, cost, gradient (and left over) of the best point
         self.best_cost, self.weight = np.inf, 0.0
         seen = lanes.common.eigen[0][k][~lanes.common.free[k]]
+        self.free = self._free()
         self.weakest = float(seen.min(initial=np.inf))  # of what the data see of common directions
+
+    def _free(self) -> Float:
+        """Steps of all stations along the directions that are free, as orthogonal rows of length 1 (m, A k)."""
+        common, k = self.lanes.common, self.k
+        found = np.einsum("kn,kij->nij", common.eigen[1][k][:, common.free[k]], common.generators)
+        each = np.where(self.active[:, None, None], found[:, None], 0.0 + 0j).view(float)
+        flat = (each.reshape(len(found), -1, 8) @ self.basis).reshape(len(found), -1)
+        return np.asarray(np.linalg.qr(flat.T)[0].T)
 
     def next(self, jones: Complex, share: float, left_over: Complex, new: Complex) -> tuple[Complex, float]:
         """The next matrices (A, 2, 2), and how long the step is: infinite where it was damped or taken back."""
@@ -147,7 +156,9 @@ class _Lane:
         self.moves = common.moves(k, jones)
         self.each = mat2.mul(mat2.herm(jones), left_over)
         whole = np.ascontiguousarray(self.each.reshape(-1)).view(float) - common.weight[k] * (y @ self.moves)
-        return (whole.reshape(-1, 8) @ self.basis).ravel()
+        gradient = (whole.reshape(-1, 8) @ self.basis).ravel()
+        # the prior may not turn what is free: it would never come to an end
+        return gradient - self.free.T @ (self.free @ gradient)
 
     def _factored(self, jones: Complex) -> None:
         """Cholesky factors of the normal matrix with the prior, the gauge and the damping."""
@@ -156,12 +167,9 @@ class _Lane:
         second = self.each if self.within and not self.damping else None
         normal = normal_matrix(v, m, self.a1, self.a2, jones, self.pattern, second)
         diagonal = np.einsum("ii->i", normal)
-        held = [np.sqrt(common.weight[k]) * (self.moves.reshape(-1, len(jones), 8) @ self.basis)]
-        for matrix in np.einsum("kn,kij->nij", common.eigen[1][k][:, common.free[k]], common.generators):
-            # what the model does not see stays where it is
-            u = np.where(self.active[:, None, None], matrix, 0.0 + 0j).view(float).reshape(-1, 8) @ self.basis
-            held.append(u[None] * np.sqrt(diagonal.mean() / max(float((u**2).sum()), 1e-300)))
-        rows = np.concatenate(held).reshape(-1, len(normal))
+        prior = (self.moves.reshape(-1, len(jones), 8) @ self.basis).reshape(-1, len(normal))
+        # what the model does not see stays where it is
+        rows = np.concatenate([np.sqrt(common.weight[k]) * prior, np.sqrt(diagonal.mean()) * self.free])
         upper = blas.dsyrk(1.0, rows.T, beta=1.0, c=normal.T, overwrite_c=1)  # of the transpose: normal is row by row
         diagonal *= 1 + self.damping
         diagonal[:] = np.where(diagonal > 0, diagonal, 1.0)
