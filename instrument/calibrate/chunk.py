@@ -106,8 +106,8 @@ class Job:
         # J^-1 magnifies what is left over: by its condition number for either station
         with np.errstate(invalid="ignore"):
             worst = fit.left.worst * np.median(np.where(held, mat2.condition(jones), 1.0), axis=1) ** 2
-        for k in np.flatnonzero(hard):
-            lanes.factors.pop(int(k), None)
+        for other in np.flatnonzero(hard).tolist():
+            lanes.factors.pop(other, None)
         error, common_error = lanes.errors(jones, fit.left.share, self.gauge)
         failed_lanes = [o is not Outcome.CONVERGED for o in outcome]
         jones[failed_lanes] = error[failed_lanes] = common_error[failed_lanes] = np.nan

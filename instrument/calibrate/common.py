@@ -8,11 +8,11 @@ from instrument import mat2
 from instrument.calibrate.gauge import BLIND, GENERATORS, HELD_TO, UNKNOWNS, common_form, second_moment
 from instrument.units import Bool, Complex, Float, Int
 
-WEAK = 1e-3  # share of the model's power below which sweeps and averages do not find a common direction
+WEAK = 0.1  # share of the model's power below which sweeps and averages do not find a common direction
 
 
 class CommonPart:
-    """Common matrices exp(sum_k y_k G_k) of some lanes (L), for stations (L, A) that are tied, samples (L,) that count.
+    """Common matrices exp(sum_k y_k G_k) of some lanes (L), (L, A) tied stations, (L,) samples.
 
     Through beams the data see some of them with 1e-8 of their power: a step J (1 + y G) leaves the data by y², of which
     they see more than of y itself, and noise moves y without end. So steps are exponentials, and y, the least-squares
@@ -39,8 +39,9 @@ class CommonPart:
         self.tangents = np.einsum("laij,njk->lnaik", start, self.generators)
         flat = self.tangents.reshape(*self.form.shape[:2], -1)
         gram = (flat.conj() @ np.swapaxes(flat, 1, 2)).real
-        size = np.maximum(np.trace(gram, axis1=1, axis2=2), 1e-300)[:, None, None]
-        self.back = np.linalg.inv(gram / size + 1e-12 * np.eye(gram.shape[1])) / size
+        size = np.trace(gram, axis1=1, axis2=2)[:, None, None]
+        gram = gram / np.where(size > 0, size, 1.0) + 1e-12 * np.eye(gram.shape[1])
+        self.back = np.where(size > 0, np.linalg.inv(gram) / np.where(size > 0, size, 1.0), 0.0)
         self.weight = np.full(len(start), np.inf)
 
     def moved(self, lane: int, jones: Complex) -> Float:
@@ -49,12 +50,12 @@ class CommonPart:
         return np.asarray(self.back[lane] @ apart)
 
     def moves(self, lane: int, jones: Complex) -> Float:
-        """What steps J_a exp(e_a) of matrices (A, 2, 2) do to `moved` of a lane, (n, 8 A): re, im of e00, e01, e10, e11."""
+        """What steps J_a exp(e_a) of (A, 2, 2) do to `moved` of a lane, (n, 8 A): re, im of e00, e01, e10, e11."""
         each = np.einsum("naik,aij->najk", self.tangents[lane].conj(), jones)
         return self.back[lane] @ np.stack([each.real, -each.imag], axis=-1).reshape(len(each), -1)
 
     def weigh(self, lane: int, share: float) -> float:
-        """The weight of the prior of a lane, lowered to what a share of the power of the data that is left makes of it."""
+        """The weight of the prior of a lane, lowered to what a share of the data's power that is left makes of it."""
         found = max(share, 0.0) * self.total[lane] / self.freedom[lane] / HELD_TO**2
         self.weight[lane] = min(self.weight[lane], found)
         return float(self.weight[lane])
@@ -75,4 +76,6 @@ def exponential(matrix: Complex) -> Complex:
     d = np.sqrt(-mat2.det(rest) + 0j)
     far = np.abs(d) > 1e-5
     ratio = np.where(far, np.sinh(d) / np.where(far, d, 1.0), 1 + d * d / 6)
-    return np.asarray(np.exp(half)[..., None, None] * (np.cosh(d)[..., None, None] * mat2.IDENTITY + ratio[..., None, None] * rest))
+    return np.asarray(
+        np.exp(half)[..., None, None] * (np.cosh(d)[..., None, None] * mat2.IDENTITY + ratio[..., None, None] * rest)
+    )

@@ -1,4 +1,4 @@
-"""Standard errors of gains and of common directions, from the normal matrix of an interval and what is left of its data."""
+"""Standard errors of gains and of common directions, from the normal matrix of an interval and what is left over."""
 
 from __future__ import annotations
 

@@ -15,6 +15,8 @@ from instrument.units import Bool, Complex, Float, Int
 
 NEAR = 0.1  # relative step of averaged sweeps below which all stations are solved at once
 AGAIN = 0.3  # of the last step: where steps shrink by less, the normal matrix is worked out again
+ROUNDING = 4 * mat2.UNIT  # of the power of the data: what sums of a sweep are wrong by along a common direction
+FLOOR = 1e-13  # of the power of the data, added to what steps along common directions cost: they are held up by 1e-5
 SLACK = 1e-12  # of the power of the data: rounding, as it sums up over sweeps
 
 
@@ -42,7 +44,7 @@ class Side(Protocol):
 
 
 def solved_together(lanes: Side, jones: Complex) -> tuple[Complex, Float, Int, Float]:
-    """Matrices (L, A, 2, 2), last steps, iterations, worst step of each, as `Lanes.iterate`, from matrices to start at."""
+    """Matrices (L, A, 2, 2), last steps, iterations, worst step of each, as `Lanes.iterate`, from a start."""
     jones = np.where(lanes.active[..., None, None], jones, 0.0)
     lanes.common.begin(jones)
     sums = _Sums(lanes)
@@ -95,16 +97,15 @@ class _Lane:
         self.best: Any = None  # matrices, cost, gradient (and left over) of the best point
         self.best_cost, self.weight = np.inf, 0.0
         seen = lanes.common.eigen[0][k][~lanes.common.free[k]]
-        self.free = self._free()
+        self.together = self._together_rows()
         self.weakest = float(seen.min(initial=np.inf))  # of what the data see of common directions
 
-    def _free(self) -> Float:
-        """Steps of all stations along the directions that are free, as orthogonal rows of length 1 (m, A k)."""
+    def _together_rows(self) -> Float:
+        """Steps of all stations along the common directions, weakest first (n, A k)."""
         common, k = self.lanes.common, self.k
-        found = np.einsum("kn,kij->nij", common.eigen[1][k][:, common.free[k]], common.generators)
+        found = np.einsum("kn,kij->nij", common.eigen[1][k], common.generators)
         each = np.where(self.active[:, None, None], found[:, None], 0.0 + 0j).view(float)
-        flat = (each.reshape(len(found), -1, 8) @ self.basis).reshape(len(found), -1)
-        return np.asarray(np.linalg.qr(flat.T)[0].T)
+        return (each.reshape(len(found), -1, 8) @ np.linalg.pinv(self.basis).T).reshape(len(found), -1)
 
     def next(self, jones: Complex, share: float, left_over: Complex, new: Complex) -> tuple[Complex, float]:
         """The next matrices (A, 2, 2), and how long the step is: infinite where it was damped or taken back."""
@@ -125,6 +126,8 @@ class _Lane:
         common, k = self.lanes.common, self.k
         weight, y = common.weigh(k, share), common.moved(k, jones)
         cost = share + weight * float(y @ y) / common.total[k]
+        if not np.isfinite(cost):
+            return jones, np.nan
         if cost <= self.best_cost + SLACK:
             self.best, self.best_cost = (jones.copy(), left_over, new, y), cost
             self.damping = self.damping / 10 if self.damping > 1e-3 else 0.0
@@ -149,16 +152,32 @@ class _Lane:
         turned = np.where(odd[:, None, None], new, turned)
         if odd.any():
             length = max(length, _relative(np.where(odd[:, None, None], new - jones, 0.0), new))
-        return np.where(_dead(new), 0.0, turned), length if not self.damping else max(length, 2 * self.lanes.settings.tolerance)
+        return np.where(_dead(new), 0.0, turned), length if not self.damping else max(
+            length, 2 * self.lanes.settings.tolerance
+        )
 
     def _gradient(self, jones: Complex, left_over: Complex, y: Float) -> Float:
         common, k = self.lanes.common, self.k
         self.moves = common.moves(k, jones)
-        self.each = mat2.mul(mat2.herm(jones), left_over)
-        whole = np.ascontiguousarray(self.each.reshape(-1)).view(float) - common.weight[k] * (y @ self.moves)
-        gradient = (whole.reshape(-1, 8) @ self.basis).ravel()
-        # the prior may not turn what is free: it would never come to an end
-        return gradient - self.free.T @ (self.free @ gradient)
+        data = np.ascontiguousarray(mat2.mul(mat2.herm(jones), left_over).reshape(-1)).view(float)
+        whole = data - common.weight[k] * (y @ self.moves)
+        self.each = whole.view(complex).reshape(jones.shape)
+        return (whole.reshape(-1, 8) @ self.basis).ravel()
+
+    def _without_rounding(self, gradient: Float) -> Float:
+        """A gradient without what it has along common directions that are free, or weak and within rounding.
+
+        The prior may not turn what is free: it would never come to an end. Taken away as the stations are seen: a weak
+        station would be moved by the rounding of a strong one.
+        """
+        common, k = self.lanes.common, self.k
+        along = self.together @ gradient
+        idle = common.free[k] | (common.weak[k] & (np.abs(along) < ROUNDING * common.total[k]))
+        if not idle.any():
+            return gradient
+        rows = self.together[idle]
+        spread = rows * self.own
+        return np.asarray(gradient - spread.T @ (np.linalg.pinv(spread @ rows.T, hermitian=True) @ along[idle]))
 
     def _factored(self, jones: Complex) -> None:
         """Cholesky factors of the normal matrix with the prior, the gauge and the damping."""
@@ -168,8 +187,12 @@ class _Lane:
         normal = normal_matrix(v, m, self.a1, self.a2, jones, self.pattern, second)
         diagonal = np.einsum("ii->i", normal)
         prior = (self.moves.reshape(-1, len(jones), 8) @ self.basis).reshape(-1, len(normal))
-        # what the model does not see stays where it is
-        rows = np.concatenate([np.sqrt(common.weight[k]) * prior, np.sqrt(diagonal.mean()) * self.free])
+        self.own = diagonal.copy()
+        # what the model does not see stays where it is; through one direction the data see less than common matrices
+        free = self.together[common.free[k]]
+        size = np.maximum((free**2 * self.own).sum(axis=1), 1e-300)[:, None]
+        weight = common.weight[k] + FLOOR * common.total[k]
+        rows = np.concatenate([np.sqrt(weight) * prior, free * self.own / np.sqrt(size)])
         upper = blas.dsyrk(1.0, rows.T, beta=1.0, c=normal.T, overwrite_c=1)  # of the transpose: normal is row by row
         diagonal *= 1 + self.damping
         diagonal[:] = np.where(diagonal > 0, diagonal, 1.0)
@@ -182,6 +205,7 @@ class _Lane:
 
     def _step(self, jones: Complex, gradient: Float) -> tuple[Complex, float]:
         """The step e (A, 2, 2), and what the data could gain by it in their rms."""
+        gradient = self._without_rounding(gradient)
         found, _ = lapack.dpotrs(self.factor, gradient, lower=0)
         gained = float(np.sqrt(max(found @ gradient, 0.0) / self.lanes.common.total[self.k]))
         step = (found.reshape(len(jones), -1) @ self.basis.T).copy().view(complex).reshape(jones.shape)

@@ -1,4 +1,4 @@
-"""The normal matrix of one interval: what steps J_a exp(e_a) of all stations at once do to the data, to second order."""
+"""The normal matrix of one interval: what steps J_a exp(e_a) of all stations do to the data, to second order."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def normal_matrix(
     """Half the second derivative of the power that steps J_a exp(e_a) leave, (A k, A k); its lower triangle counts.
 
     v, m (N, 2, 2) weighted data and model, jones (A, 2, 2). With `left_over`, sum_b J_a^H E_ab J_b M_ab^H (A, 2, 2) for
-    what is left E, it is all of it (Newton); without, what the steps do to the fit (Gauss and Newton).
+    what is left E (less what a prior makes of it), it is all of it (Newton); without, that of the fit (Gauss, Newton).
     """
     stations, second = len(jones), left_over is not None
     out, inner = np.zeros((8 * stations, 8 * stations)), np.zeros((stations, 2, 2), complex)
@@ -51,7 +51,11 @@ def normal_matrix(
     basis = BASIS[pattern]
     both = np.tril(out) + np.tril(out, -1).T
     size = basis.shape[1] * stations
-    return np.asarray(np.einsum("ki,akbl,lj->aibj", basis, both.reshape(stations, 8, stations, 8), basis, optimize=True).reshape(size, size))
+    return np.asarray(
+        np.einsum("ki,akbl,lj->aibj", basis, both.reshape(stations, 8, stations, 8), basis, optimize=True).reshape(
+            size, size
+        )
+    )
 
 
 @numba.njit(inline="always")

@@ -46,11 +46,12 @@ def write_h5parm(
     unflagged; they read back as NaN. Positions and directions that are not known are NaN. A `DirectionalSolution`
     gets an axis `dir`, and `directions` (SkyCoord by cluster) says where its clusters are; clusters of different
     intervals are put on one grid of times. A table constant in time or frequency is written without that axis.
+    Standard errors of a solution that has them are a dataset `error` beside `val`, in its unit.
     """
     if pattern not in POLS:
         raise InputError(f"no pattern '{pattern}': {did_you_mean(str(pattern), POLS)}")
     clusters = solution.clusters if isinstance(solution, DirectionalSolution) else {"": solution}
-    values, slots_s, freq_hz, names = _stacked(clusters, at)
+    values, error, slots_s, freq_hz, names = _stacked(clusters, at)
     usable: Any = np.isfinite(values).all(axis=(-2, -1)) & np.isfinite(mat2.inverse(values)).all(axis=(-2, -1))
     gains = np.stack([_in_pattern(one, pattern) for one in np.moveaxis(values, 3, 0)], axis=3)
 
@@ -63,6 +64,7 @@ def write_h5parm(
     axes = [axis for axis in AXES if there[axis]]
     weight = np.broadcast_to(usable[..., None], gains.shape).astype(np.float32)
     parts = {"amplitude": np.abs(gains), "phase": np.where(np.isfinite(gains), np.angle(gains), np.nan)}
+    errors = _errors(error, gains)
     said = written_by()
     known = ", ".join(f"{name} {value}" for name, value in said.items() if name not in ("written", "software"))
     history = f"{said['written']}: CREATE by {said['software']}{known and f' ({known})'}"
@@ -79,7 +81,7 @@ def write_h5parm(
             soltab.attrs["TITLE"], soltab.attrs["h5parm_version"] = np.bytes_(kind), np.bytes_("1.0")
             for axis in axes:
                 soltab[axis] = along[axis]
-            for name, array in (("val", parts[kind]), ("weight", weight)):
+            for name, array in (("val", parts[kind]), ("weight", weight), *((n, e[kind]) for n, e in errors.items())):
                 soltab[name] = array.reshape([len(along[axis]) for axis in axes])
                 soltab[name].attrs["AXES"] = np.bytes_(",".join(axes))
             soltab["val"].attrs["HISTORY000"] = np.bytes_(history.encode()[:60000])  # an attribute holds 64 kB
@@ -87,8 +89,8 @@ def write_h5parm(
 
 def _stacked(
     clusters: Mapping[str, Solution | JonesTable], at: Sampling | None
-) -> tuple[Complex, Float, Float, tuple[str, ...]]:
-    """Matrices (t, f, A, C, 2, 2) of all clusters on one grid of times, the grid, the channels and the stations."""
+) -> tuple[Complex, Float, Float, Float, tuple[str, ...]]:
+    """Matrices (t, f, A, C, 2, 2) of all clusters on one grid of times, errors; the grid, channels and stations."""
     tables = [one if isinstance(one, JonesTable) else one.term for one in clusters.values()]
     if not tables:
         raise InputError("the solution holds no cluster")
@@ -100,7 +102,8 @@ def _stacked(
     lengths = [one.interval_s for one in clusters.values() if isinstance(one, Solution)]
     slots_s = _common_times(tables, lengths)
     out = np.full((len(slots_s), len(tables[0].freq_hz), len(names), len(tables), 2, 2), np.nan + 0j)
-    for c, table in enumerate(tables):
+    error = np.full(out.shape, np.nan)
+    for c, (table, one) in enumerate(zip(tables, clusters.values(), strict=True)):
         if table.stations not in ((), names) or not np.array_equal(table.freq_hz, tables[0].freq_hz):
             raise InputError("the clusters have other stations or channels than one another")
         if table.values.shape[2] not in (1, len(names)):
@@ -110,7 +113,19 @@ def _stacked(
             rows = nearest(table.slots_s, slots_s)
             known = np.abs(table.slots_s[rows] - slots_s) < lengths[c] / 2
         out[known, :, :, c] = table.values[rows[known]]
-    return out, slots_s, tables[0].freq_hz, names
+        if isinstance(one, Solution) and one.error.shape == table.values.shape:
+            error[known, :, :, c] = one.error[rows[known]]
+    return out, error, slots_s, tables[0].freq_hz, names
+
+
+def _errors(error: Float, gains: Complex) -> dict[str, dict[str, Float]]:
+    """Errors (t, f, A, C, 2, 2), if any, as those of amplitudes and of phases (rad) of gains (t, f, A, C, P)."""
+    if not np.isfinite(error).any():
+        return {}
+    flat = error.reshape(*error.shape[:-2], 4)
+    kept = flat[..., {1: [0], 2: [0, 3], 4: [0, 1, 2, 3]}[gains.shape[-1]]]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return {"error": {"amplitude": kept, "phase": kept / np.abs(gains)}}
 
 
 def _common_times(tables: Sequence[JonesTable], lengths: Sequence[float]) -> Float:

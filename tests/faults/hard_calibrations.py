@@ -12,6 +12,7 @@ import numpy as np
 from astropy import units as u
 from astropy.coordinates import SkyCoord
 
+import instrument
 from instrument import Composed, Observation, Outcome, PointSky, Scene, SelfCal, mat2
 from instrument.observe.layout import Layout
 
@@ -44,8 +45,12 @@ class Verdict:
 
 
 @cache
-def array(stations, seed):
-    """An array of some stations within about 1 km."""
+def array(stations, seed, beams=False):
+    """An array of some stations within about 1 km; or stations of LOFAR with their beams."""
+    if beams:
+        names = np.array(instrument.load("telescopes", "lofar-hba", beam=None).layout().names)
+        some = np.random.default_rng([stations, seed]).choice(len(names), stations, replace=False)
+        return instrument.load("telescopes", "lofar-hba", stations=names[np.sort(some)].tolist(), element="hamaker")
     enu = np.random.default_rng([stations, seed]).normal(size=(stations, 3)) * [1e3, 1e3, 10]
     names = [f"s{k}" for k in range(stations)]
     place = {"longitude": 6.9 * u.deg, "latitude": 52.9 * u.deg, "height": 0 * u.m}
@@ -144,18 +149,19 @@ NORMAL = (
 )
 
 
-def drawn(kind, seed):
-    """One case of a kind."""
+def drawn(kind, seed, beams=False):
+    """One case of a kind; with beams in the model two in three skies have no polarization of their own."""
     rng = np.random.default_rng([seed, sum(map(ord, kind))])
     pattern = PATTERNS[seed % 4]
     stations = int(rng.integers(10, 15)) if kind.startswith("RFI") and seed % 3 else int(rng.integers(5, 10))
     times, channels = (2, 3) if kind in ("one channel bipartite", "channels together") else (2, 1)
     if kind == "minutes together":
         times = 6
-    where, stokes = sky_of(rng, int(rng.integers(2, 6)), 0.3 if seed % 3 else 0.0)
+    plain = bool(seed % 3) == beams
+    where, stokes = sky_of(rng, int(rng.integers(2, 6)), 0.0 if plain else 0.3)
     if kind == "one source":
         where, stokes = where[:1], stokes[:1]
-    inst = array(stations, seed % 5)
+    inst = array(stations, seed % 5, beams)
     truth = seen(inst, where, stokes, times, channels)
     size = 0.3 if kind in HARD else 10 ** rng.uniform(-2.5, -0.7)
     steady = kind in ("minutes together", "channels together")
