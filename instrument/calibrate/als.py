@@ -142,3 +142,10 @@ def power_of(values: Complex) -> Float:
     """Sum of |x|^2 of matrices (..., 2, 2), (...); without the roots of `abs`."""
     flat = np.ascontiguousarray(values).view(float).reshape(*values.shape[:-2], 8)
     return np.asarray(np.einsum("...i,...i->...", flat, flat))
+
+
+def unit_diagonal(jones: Complex) -> Complex:
+    """Matrices (..., 2, 2) with diagonal entries of size 1."""
+    size = np.abs(jones)
+    out = np.where(size > 0, jones / np.where(size > 0, size, 1), 0.0)
+    return np.where((size > 0) | (np.eye(2) == 0), out, 1.0)

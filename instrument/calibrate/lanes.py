@@ -6,7 +6,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from instrument.calibrate.als import LANES, matrices, planar, power_of, residual, solve_stations, sweep
+from instrument.calibrate.als import LANES, matrices, planar, power_of, residual, solve_stations, sweep, unit_diagonal
 from instrument.calibrate.common import CommonPart
 from instrument.calibrate.errors import gain_errors
 from instrument.calibrate.fit import Left
@@ -162,21 +162,25 @@ class Lanes:
         plus, minus, _, gain = self._coupling(jones, np.zeros(self.count))
         size = power_of(jones)
         total = (self.power * size[:, :, None] * size[:, None, :]).sum(axis=2) / 8
-        u = total / np.maximum(total.sum(axis=1, keepdims=True), 1e-300)
-        ways = [np.einsum("laa->la", plus), np.maximum(np.einsum("laa->la", minus) - u, 0.0)]
-        mean = ways[1] if self.settings.pattern == "phase" else sum(ways)
-        each = mean / (2 if self.settings.pattern == "scalar" else 1) / np.where(total > 0, total, np.nan) / 2
+        root = np.sqrt(size / 2)
+        whole = minus / np.where(total > 0, total, np.inf)[:, None] * root[:, :, None] * root[:, None, :]
+        q = root / np.maximum(np.linalg.norm(root, axis=1, keepdims=True), 1e-300)
+        along = np.einsum("lab,lb->la", whole, q)
+        turned = np.einsum("laa->la", whole) - 2 * q * along + q**2 * (q * along).sum(axis=1, keepdims=True)
+        grown = np.einsum("laa->la", plus) / np.where(total > 0, total, np.inf) * root**2
+        each = np.maximum(turned + (0 if self.settings.pattern == "phase" else grown), 0.0) / 2
+        each = np.where(total > 0, each / (2 if self.settings.pattern == "scalar" else 1), np.nan)
         allowed = (BASIS[self.settings.pattern] != 0).any(axis=1)[::2].reshape(2, 2)
-        error = np.sqrt(each * size / 2)[..., None, None] * np.where(allowed, 1.0, 0.0)
-        along = np.einsum("kij,nij->nk", self.common.generators.conj(), gauge.directions).real / 2
-        bent = np.einsum("nk,lkm,nm->ln", along, self.common.form, along) * gain[:, None]
+        error = np.sqrt(each)[..., None, None] * np.where(allowed, 1.0, 0.0)
+        ways = np.einsum("kij,nij->nk", self.common.generators.conj(), gauge.directions).real / 2
+        bent = np.einsum("nk,lkm,nm->ln", ways, self.common.form, ways) * gain[:, None]
         with np.errstate(divide="ignore"):
             common = np.where(free, np.inf, 1 / np.sqrt(np.maximum(bent, 0.0)))
         for k, (upper, weight) in self.factors.items():
             most = HELD_TO / np.sqrt(max(variance[k], 1e-300))
             error[k], common[k] = gain_errors(upper, jones[k], basis, gauge.directions, free, weight, most)
-        root = np.sqrt(variance)
-        return error * root[:, None, None, None], common * root[:, None]
+        sigma = np.sqrt(variance)
+        return error * sigma[:, None, None, None], common * sigma[:, None]
 
     def normal(self, left: Float) -> Complex:
         """sum Z Z^H of each station (L, A, 2, 2)."""
@@ -216,7 +220,7 @@ class Lanes:
         # a station without any signal is dead: its answer is zero, and half the way would never get there
         result = np.where((new == 0).all(axis=(-2, -1))[..., None, None], 0.0, result)
         if self.settings.pattern == "phase":
-            result = _unit_diagonal(result)
+            result = unit_diagonal(result)
         result = np.where(self.active[..., None, None], result, 0.0)
         return result, _relative(result - old, size, floor), close
 
@@ -242,7 +246,7 @@ class Lanes:
                 sub = full[:, :, 0, :, 0] + full[:, :, 1, :, 1]
             vector = np.linalg.eigh(sub)[1][:, :, -1] * np.sqrt(stations)
             out[:, :, r, r] = vector
-        return _unit_diagonal(out) if self.settings.pattern == "phase" else out
+        return unit_diagonal(out) if self.settings.pattern == "phase" else out
 
     def left(self, jones: Complex, samples: Int) -> Left:
         """What matrices leave of the data, by baseline; `samples` (L, B) count."""
@@ -324,9 +328,3 @@ def _right_ratio(old: Complex, new: Complex) -> tuple[Complex, Any]:
         / np.where(good, det, 1)[..., None, None]
     )
     return np.where(good[..., None, None], inverse @ new, np.eye(2)), good
-
-
-def _unit_diagonal(jones: Complex) -> Complex:
-    size = np.abs(jones)
-    out = np.where(size > 0, jones / np.where(size > 0, size, 1), 0.0)
-    return np.where((size > 0) | (np.eye(2) == 0), out, 1.0)

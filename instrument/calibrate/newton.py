@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import blas, lapack
 
 from instrument import mat2
-from instrument.calibrate.als import matrices, planar, power_of, solve_stations, sweep
+from instrument.calibrate.als import matrices, planar, power_of, solve_stations, sweep, unit_diagonal
 from instrument.calibrate.common import CommonPart, exponential
 from instrument.calibrate.normal import BASIS, normal_matrix
 from instrument.units import Bool, Complex, Float, Int
@@ -116,7 +116,8 @@ class _Lane:
         new = np.where(self.active[:, None, None], new, 0.0)
         change = _relative(new - jones, new)
         if self.far and change > NEAR:
-            return np.where(_dead(new), 0.0, (jones + new) / 2), change
+            half = (jones + new) / 2
+            return np.where(_dead(new), 0.0, unit_diagonal(half) if self.pattern == "phase" else half), change
         if self.far:
             self.far = False
             self.lanes.common.weight[self.k] = np.inf
@@ -127,7 +128,7 @@ class _Lane:
         weight, y = common.weigh(k, share), common.moved(k, jones)
         cost = share + weight * float(y @ y) / common.total[k]
         if not np.isfinite(cost):
-            return jones, np.nan
+            return np.zeros_like(jones) if self.best is None else self.best[0], np.nan
         if cost <= self.best_cost + SLACK:
             self.best, self.best_cost = (jones.copy(), left_over, new, y), cost
             self.damping = self.damping / 10 if self.damping > 1e-3 else 0.0
@@ -152,9 +153,11 @@ class _Lane:
         turned = np.where(odd[:, None, None], new, turned)
         if odd.any():
             length = max(length, _relative(np.where(odd[:, None, None], new - jones, 0.0), new))
-        return np.where(_dead(new), 0.0, turned), length if not self.damping else max(
-            length, 2 * self.lanes.settings.tolerance
-        )
+        if not np.isfinite(turned).all():
+            return jones, np.nan
+        if self.damping:  # a short step is no sign of an end
+            length = max(length, 2 * self.lanes.settings.tolerance)
+        return np.where(_dead(new), 0.0, turned), length
 
     def _gradient(self, jones: Complex, left_over: Complex, y: Float) -> Float:
         common, k = self.lanes.common, self.k
@@ -199,7 +202,10 @@ class _Lane:
         self.weight = float(common.weight[k])
         self.factor, bent = lapack.dpotrf(upper, lower=0, overwrite_a=1, clean=0)
         self.fresh = True
-        if bent and second is not None:
+        if (
+            bent and self.damping < 1e6
+        ):  # on a slope that bends down, or singular: the fit alone, or held by what rounding leaves
+            self.damping = self.damping if second is not None else max(10 * self.damping, 1e-8)
             self.within = False
             self._factored(jones)
 

@@ -10,11 +10,11 @@ hard = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(hard)
 
 
-def silent(kinds, cases, first=0):
+def silent(kinds, cases, first=0, beams=False):
     found = []
     for kind in kinds:
         for seed in range(first, first + cases):
-            v = hard.judged(hard.drawn(kind, seed))
+            v = hard.judged(hard.drawn(kind, seed, beams))
             if v.converged and v.worst > hard.WRONG and not v.said:
                 found.append((kind, seed, v.worst))
     return found
@@ -31,11 +31,17 @@ def test_d1_d2_d4_300_hard_cases_are_right_or_said():
 
 
 @pytest.mark.long
-def test_ordinary_cases_converge():
+def test_300_hard_cases_through_beams_are_right_or_said():
+    assert silent(hard.HARD, 15, beams=True) == []
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("beams", [False, True])
+def test_ordinary_cases_converge(beams):
     """No noise, noise, intervals of several samples, simpler patterns, incomplete models, short baselines left out."""
     kinds = [k for k in hard.NORMAL if k not in ("noise above the signal", "strong and weak stations, noise")]
     for kind in kinds:
-        found = [hard.judged(hard.drawn(kind, seed)) for seed in range(6)]
+        found = [hard.judged(hard.drawn(kind, seed, beams)) for seed in range(6)]
         assert sum(v.converged for v in found) == sum(v.intervals for v in found), kind
 
 
