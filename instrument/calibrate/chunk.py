@@ -102,29 +102,17 @@ class Job:
         few = fit.odd.any(axis=1) | fit.left.few_fit(s.unexplained)
         failed = few & [o in (Outcome.POOR_FIT, Outcome.ITERATION_LIMIT) for o in outcome]
         found = suspects(v[failed], m[failed], a1, a2, held[failed], s) if failed.any() else {}
-        lost = np.flatnonzero(failed)
         # J^-1 magnifies what is left over: by its condition number for either station
         with np.errstate(invalid="ignore"):
             worst = fit.left.worst * np.median(np.where(held, mat2.condition(jones), 1.0), axis=1) ** 2
-        for other in np.flatnonzero(hard).tolist():
+        for other in np.flatnonzero(hard).tolist():  # solved from another start since
             lanes.factors.pop(other, None)
-        error, common_error = lanes.errors(jones, fit.left.share, self.gauge)
-        failed_lanes = [o is not Outcome.CONVERGED for o in outcome]
-        jones[failed_lanes] = error[failed_lanes] = common_error[failed_lanes] = np.nan
-        jones[~held] = error[~held] = np.nan
-        named = {int(lost[k]): mask for k, mask in found.items()}
-        return Part(
-            jones * level[:, None, None, None],
-            outcome,
-            fit.count,
-            fit.left.share,
-            worst,
-            history,
-            gauges,
-            named,
-            error * level[:, None, None, None],
-            common_error,
-        )
+        named = {int(np.flatnonzero(failed)[k]): mask for k, mask in found.items()}
+        lost = np.array([o is not Outcome.CONVERGED for o in outcome])
+        jones, error, common_error = _with_errors(lanes, fit, lost, self.gauge)
+        scale = level[:, None, None, None]
+        share, gains = fit.left.share, jones * scale
+        return Part(gains, outcome, fit.count, share, worst, history, gauges, named, error * scale, common_error)
 
     def _tied(self, v: Complex, m: Complex) -> tuple[Complex, Complex, Bool, Bool, Int]:
         """Data and model (L, N, 2, 2) where they count; stations (L, A) with a model, those tied; samples (L, B)."""
@@ -192,6 +180,15 @@ class Job:
             return False
         every, alike = freedom(model, np.ones(len(model)), vis.antenna1, vis.antenna2, len(held))
         return every > alike
+
+
+def _with_errors(lanes: Lanes, fit: Fits, lost: Any, gauge: Gauge) -> tuple[Complex, Float, Float]:
+    """Matrices, their errors (L, A, 2, 2) and those of common directions (L, n); NaN where there is no solution."""
+    jones = fit.jones
+    error, common_error = lanes.errors(jones, fit.left.share, gauge)
+    jones[lost] = error[lost] = common_error[lost] = np.nan
+    jones[~lanes.active] = error[~lanes.active] = np.nan
+    return jones, error, common_error
 
 
 def _ends(a1: Int, a2: Int, stations: int) -> Int:

@@ -32,7 +32,7 @@ def normal_matrix(
     stations, second = len(jones), left_over is not None
     out, inner = np.zeros((8 * stations, 8 * stations)), np.zeros((stations, 2, 2), complex)
     square = np.conj(np.swapaxes(jones, 1, 2)) @ jones
-    _fill(v, m, a1, a2, jones, square, second, out, inner)
+    _fill(v, m, np.stack([a1, a2]), jones, square, second, out, inner)
     own = np.einsum("aik,alj->aijkl", square, inner).reshape(stations, 4, 4)
     block = np.empty((stations, 4, 2, 4, 2))
     block[:, :, 0, :, 0] = block[:, :, 1, :, 1] = own.real
@@ -64,17 +64,17 @@ def _entries(x: Any) -> Any:
 
 
 @compiled(nogil=True, fastmath=FAST, error_model="numpy")
-def _fill(v: Any, m: Any, a1: Any, a2: Any, jones: Any, square: Any, second: Any, out: Any, inner: Any) -> None:
+def _fill(v: Any, m: Any, ends: Any, jones: Any, square: Any, second: Any, out: Any, inner: Any) -> None:
     """Blocks of pairs of stations, below the diagonal of out, and sum M Q_b M^H (A, 2, 2) of each station in inner.
 
     With X = Q_a M, Y = M Q_b, Q = J^H J, two steps have conj(e_a[ij]) conj(e_b[kl]) X[il] conj(Y[jk]) in common, and
     what is left, E, has conj(F[ik]) M[jl] with e_a[ij] conj(e_b[kl]), F = J_a^H E J_b.
     """
-    baselines = len(a1)
+    baselines = ends.shape[1]
     x, y = np.empty((2, 2), np.complex128), np.empty((2, 2), np.complex128)
     f, mm = np.empty((2, 2), np.complex128), np.empty((2, 2), np.complex128)
     for n in range(len(m)):
-        p, q = a1[n % baselines], a2[n % baselines]
+        p, q = ends[0, n % baselines], ends[1, n % baselines]
         m00, m01, m10, m11 = _entries(m[n])
         if p == q or (m00 == 0 and m01 == 0 and m10 == 0 and m11 == 0):
             continue
@@ -91,9 +91,7 @@ def _fill(v: Any, m: Any, a1: Any, a2: Any, jones: Any, square: Any, second: Any
                     inner[p, i, j] += y[i, k] * np.conj(mm[j, k])
                     inner[q, i, j] += np.conj(mm[k, i]) * x[k, j]
         if second:
-            for i in range(2):
-                for k in range(2):
-                    f[i, k] = 0
+            f[:] = 0
             for r in range(2):
                 for c in range(2):
                     left = v[n, r, c]
