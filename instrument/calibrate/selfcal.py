@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from instrument.calibrate.als import LANES
-from instrument.calibrate.base import Calibrator, Solution, by_baseline, other_length, pair
+from instrument.calibrate.base import Calibrator, Solution, by_baseline, other_length, pair, partly_known
 from instrument.calibrate.chunk import Cell, Job
 from instrument.calibrate.gauge import gauge_of
 from instrument.checked import checked
@@ -76,7 +76,7 @@ class SelfCal(Calibrator):
             suspects=suspects,
             spoilt=by_baseline(suspects, data),
             unexplained=np.concatenate([p.worst for p in parts]).reshape(shape),
-            notes=other_length(grouped, self.interval),
+            notes=(*other_length(grouped, self.interval), *partly_known(data)),
             error=np.concatenate([p.error for p in parts]).reshape(jones.shape),
             common_error=common_error,
         )
