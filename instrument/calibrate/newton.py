@@ -8,12 +8,13 @@ import numpy as np
 from scipy.linalg import blas, lapack
 
 from instrument import mat2
-from instrument.calibrate.als import matrices, planar, power_of, solve_stations, sweep, unit_diagonal
+from instrument.calibrate.als import LANES, matrices, planar, power_of, solve_stations, sweep, unit_diagonal
 from instrument.calibrate.common import CommonPart, exponential
 from instrument.calibrate.normal import BASIS, normal_matrix
 from instrument.units import Bool, Complex, Float, Int
 
 NEAR = 0.1  # relative step of averaged sweeps below which all stations are solved at once
+FACTORS = 256e6  # bytes of normal matrices that a thread may hold: one of 512 stations takes 134 MB
 AGAIN = 0.3  # of the last step: where steps shrink by less, the normal matrix is worked out again
 ROUNDING = 4 * mat2.UNIT  # of the power of the data: what sums of a sweep are wrong by along a common direction
 FLOOR = 1e-13  # of the power of the data, added to what steps along common directions cost: they are held up by 1e-5
@@ -41,6 +42,16 @@ class Side(Protocol):
 
     def normal(self, left: Float) -> Complex:
         """sum Z Z^H of each station (L, A, 2, 2)."""
+
+
+def lanes_of(stations: int) -> int:
+    """How many intervals are solved side by side: as many as there are vector lanes, or as their factors leave room."""
+    return int(np.clip(FACTORS / normal_bytes(stations), 1, LANES))
+
+
+def normal_bytes(stations: int) -> float:
+    """Bytes of the normal matrix of an interval."""
+    return 8.0 * (8 * stations) ** 2
 
 
 def solved_together(lanes: Side, jones: Complex) -> tuple[Complex, Float, Int, Float]:

@@ -8,10 +8,10 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from instrument.calibrate.als import LANES
 from instrument.calibrate.base import Calibrator, Solution, by_baseline, other_length, pair, partly_known
 from instrument.calibrate.chunk import Cell, Job
 from instrument.calibrate.gauge import gauge_of
+from instrument.calibrate.newton import lanes_of
 from instrument.checked import checked
 from instrument.errors import InputError
 from instrument.jones.base import JonesTerm
@@ -50,7 +50,8 @@ class SelfCal(Calibrator):
         grouped = intervals(data.at.slots_s, self.interval, data.integration_s)
         channels = self._channels(data)
         cells = [(t, f) for t in grouped.slices for f in channels]
-        chunks = [cells[i : i + LANES] for i in range(0, len(cells), LANES)]
+        size = lanes_of(len(data.layout))
+        chunks = [cells[i : i + size] for i in range(0, len(cells), size)]
         job = Job(self, data, v, m, weight, gauge_of(m, weight, self.pattern))
         with ONE_THREAD, ThreadPoolExecutor(os.cpu_count() or 1) as pool:
             parts = list(pool.map(job.solve, chunks))
@@ -63,7 +64,7 @@ class SelfCal(Calibrator):
         longest = max(len(p.history) for p in parts)
         history = np.stack([np.pad(p.history, (0, longest - len(p.history))) for p in parts]).max(axis=0)
         common_error = np.concatenate([p.common_error for p in parts]).reshape(*shape, -1)
-        suspects = _mask({i * LANES + k: x for i, p in enumerate(parts) for k, x in p.suspects.items()}, cells, data)
+        suspects = _mask({i * size + k: x for i, p in enumerate(parts) for k, x in p.suspects.items()}, cells, data)
         return Solution(
             term=JonesTable(values=jones, slots_s=grouped.centres_s, freq_hz=freqs, stations=tuple(data.layout.names)),
             outcome=outcome.reshape(shape),
@@ -72,7 +73,7 @@ class SelfCal(Calibrator):
             gauge=job.gauge.with_errors(common_error),
             history=history,
             interval_s=grouped.length_s,
-            looser=_by_cell({i * LANES + k: g for i, p in enumerate(parts) for k, g in p.gauges.items()}, shape),
+            looser=_by_cell({i * size + k: g for i, p in enumerate(parts) for k, g in p.gauges.items()}, shape),
             suspects=suspects,
             spoilt=by_baseline(suspects, data),
             unexplained=np.concatenate([p.worst for p in parts]).reshape(shape),

@@ -10,10 +10,10 @@ from typing import Any, ClassVar, Literal, NamedTuple, Self
 import numpy as np
 
 from instrument.analyze.analyzer import Analyzer
-from instrument.calibrate.als import LANES
 from instrument.calibrate.base import Calibrator, Solution
 from instrument.calibrate.by_station import rms_by_station
 from instrument.calibrate.di_errors import NAMES, DIComparison, DISums
+from instrument.calibrate.newton import lanes_of, normal_bytes
 from instrument.calibrate.selfcal import SelfCal
 from instrument.component import KIND, Component
 from instrument.errors import InputError, Outcome, did_you_mean
@@ -34,8 +34,9 @@ from instrument.whole_file import write_ecsv
 IMAGES = ("corrupted", "corrected", "corrupted - corrected", "corrected - model")
 
 SOLVE = 0.12e-6  # seconds of a visibility for each decade of tolerance
+TOGETHER = 5e-3  # seconds of an interval of 59 stations whose normal matrix is worked out
 COMPARING, MAKING = 2.1e-6, 0.3e-6  # seconds of a visibility: errors beside the truth; another block to look at
-KEPT = 300.0  # bytes of a station and interval: solutions, and what the comparison with the truth makes of them
+KEPT = 350.0  # bytes of a station and interval: solutions, and what the comparison with the truth makes of them
 SOLVING = 600.0  # bytes of a baseline in each vector lane
 
 
@@ -43,11 +44,17 @@ def solving(tolerance: float, run: Running) -> StageWork:
     """What solving all intervals down to a tolerance, and comparing with the truth, costs."""
     times, channels, baselines = run.plan.problem.shape
     stations = run.plan.problem.at.shape[2]
+    lanes = lanes_of(stations)
+    each = SOLVING * baselines
+    seconds = SOLVE * run.visibilities * max(1.0, -np.log10(tolerance))
+    if run.instrument.chain().beams().parts:  # common directions are weak, and all stations are solved at once
+        each += normal_bytes(stations)
+        seconds += TOGETHER * (stations / 59.0) ** 3 * times * channels
     return StageWork(
         f"solves of {stations} stations",
-        seconds=SOLVE * run.visibilities * max(1.0, -np.log10(tolerance)),
+        seconds=seconds,
         held_bytes=KEPT * stations * times * channels,
-        block_bytes=6 * 64.0 * float(np.prod(run.block)) + SOLVING * baselines * LANES * run.plan.workers,
+        block_bytes=6 * 64.0 * float(np.prod(run.block)) + each * lanes * run.plan.workers,
     )
 
 
