@@ -20,9 +20,13 @@ def gain_errors(
     """
     stations, size = len(jones), basis.shape[1]
     inverse, _ = lapack.dtrtri(upper, lower=0, overwrite_c=0)
-    rows = np.triu(inverse).reshape(stations, size, -1)
+    own, lower = np.empty((stations, size, size)), np.tril_indices(size, -1)
+    for a in range(stations):  # below the diagonal nothing was written
+        rows = np.array(inverse[a * size : (a + 1) * size, a * size :])
+        rows[lower] = 0.0
+        own[a] = rows @ rows.T
     turn = _left(jones) @ basis  # (A, 8, k): of e to J e
-    spread = turn @ (rows @ np.swapaxes(rows, 1, 2))
+    spread = turn @ own
     variance = (spread * turn).sum(axis=2)
     tangents = np.einsum("aij,njk->naik", jones, directions).reshape(len(directions), stations, 4)
     real = np.ascontiguousarray(tangents).view(float)  # (n, A, 8)
@@ -33,9 +37,10 @@ def gain_errors(
     both, gram = flat @ of_flat.T, flat @ flat.T
     back = np.linalg.pinv(gram, hermitian=True)
     common = back @ both @ back
-    own = np.maximum(np.diagonal(common), 0.0)
+    along_each = np.maximum(np.diagonal(common), 0.0)
     with np.errstate(divide="ignore"):
-        alone = np.where(weight * own < 1 - 1e-9, own / np.maximum(1 - weight * own, 1e-300), np.inf)
+        held = np.maximum(1 - weight * along_each, 1e-300)
+        alone = np.where(held > 1e-9, along_each / held, np.inf)
     alone = np.where(free, np.inf, alone)
     few = alone > most**2
     near = np.linalg.pinv(gram[np.ix_(few, few)], hermitian=True)
