@@ -150,11 +150,13 @@ class _Lane:
         if self.factor is None or self.weight - weight > 0.5 * (weight + self.weakest):
             self._factored(jones)
         step, gained = self._step(jones, gradient)
-        length = max(_relative(jones @ common.seen(k, step), jones), gained)
-        if length > AGAIN * self.last and not self.fresh:
+        length = self._length(jones, step, gained)
+        # what the data see once the stations follow may be far less than `weakest`: no end with a prior of before
+        stale = length <= self.lanes.settings.tolerance and self.weight > 2 * weight + FLOOR * common.total[k]
+        if (length > AGAIN * self.last or stale) and not self.fresh:
             self._factored(jones)
             step, gained = self._step(jones, gradient)
-            length = max(_relative(jones @ common.seen(k, step), jones), gained)
+            length = self._length(jones, step, gained)
         self.last, self.fresh = length, False
         # within the noise what is left over bends as much as the fit does
         self.within = gained**2 * common.freedom[k] < share * common.unknowns[k]
@@ -169,6 +171,10 @@ class _Lane:
         if self.damping:  # a short step is no sign of an end
             length = max(length, 2 * self.lanes.settings.tolerance)
         return np.where(_dead(new), 0.0, turned), length
+
+    def _length(self, jones: Complex, step: Complex, gained: float) -> float:
+        """Largest relative change of a matrix, but for what the data hardly see of it; or what they gain, if more."""
+        return max(_relative(jones @ self.lanes.common.seen(self.k, step), jones), gained)
 
     def _gradient(self, jones: Complex, left_over: Complex, y: Float) -> Float:
         common, k = self.lanes.common, self.k
