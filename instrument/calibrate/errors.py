@@ -9,14 +9,22 @@ from instrument.units import Bool, Complex, Float
 
 
 def gain_errors(
-    upper: Float, jones: Complex, basis: Float, directions: Complex, free: Bool, weight: float, most: float
+    upper: Float,
+    jones: Complex,
+    basis: Float,
+    directions: Complex,
+    free: Bool,
+    most: float,
+    weight: float,
+    prior: Float,
 ) -> tuple[Float, Float]:
     """Of every gain (A, 2, 2) and along common `directions` (n, 2, 2), for noise of variance 1 per real number.
 
     upper (A k, A k) is R of the normal matrix R^T R of steps jones_a exp(e_a), jones (A, 2, 2), basis (8, k) their real
     coordinates. That of a direction is of y in exp(sum_k y_k G_k), as the data alone have it without a prior of this
     weight, and infinite where it is `free` (n,). That of a gain is the rms of its real and its imaginary part, without
-    what it has along directions that are free or whose error is above `most`.
+    what it has along directions that are free or whose error is above `most`. `prior` (m, A k) are its rows, P^T P of
+    the normal matrix: what it pulls is no noise, the covariance is A - A P^T P A for A the inverse.
     """
     stations, size = len(jones), basis.shape[1]
     inverse, _ = lapack.dtrtri(upper, lower=0, overwrite_c=0)
@@ -31,12 +39,16 @@ def gain_errors(
     tangents = np.einsum("aij,njk->naik", jones, directions).reshape(len(directions), stations, 4)
     real = np.ascontiguousarray(tangents).view(float)  # (n, A, 8)
     right = np.einsum("nax,axk->nak", real, turn).reshape(len(directions), -1)
-    seen = lapack.dpotrs(upper, right.T, lower=0)[0].T.reshape(len(directions), stations, size)
-    along = np.einsum("nak,axk->nax", seen, turn)
-    flat, of_flat = (x.reshape(len(directions), -1) for x in (real, along))
-    both, gram = flat @ of_flat.T, flat @ flat.T
+    solved = lapack.dpotrs(upper, np.concatenate([right, prior]).T, lower=0)[0].T
+    along = np.einsum("nak,axk->nax", solved.reshape(len(solved), stations, size), turn)
+    along, pulled = along[: len(right)], along[len(right) :]
+    flat = real.reshape(len(right), -1)
+    gram = flat @ flat.T
     back = np.linalg.pinv(gram, hermitian=True)
-    common = back @ both @ back
+    common = back @ flat @ along.reshape(len(right), -1).T @ back
+    variance = variance - (pulled**2).sum(axis=0)
+    along = along - np.einsum("nm,max->nax", right @ solved[len(right) :].T, pulled)
+    both = flat @ along.reshape(len(right), -1).T
     along_each = np.maximum(np.diagonal(common), 0.0)
     with np.errstate(divide="ignore"):
         held = np.maximum(1 - weight * along_each, 1e-300)

@@ -53,7 +53,7 @@ class Lanes:
         self.power += np.swapaxes(self.power, 1, 2)
         self.a1, self.a2, self.active, self.settings = a1, a2, active, settings
         # of the normal matrices of lanes that were solved together, with the weights of their priors
-        self.factors: dict[int, tuple[Float, float]] = {}
+        self.factors: dict[int, tuple[Float, float, Float]] = {}
 
     def iterate(self, jones: Complex, far: float = FAR) -> tuple[Complex, Float, Int, Float]:
         """Sweeps until all lanes stand still: matrices (L, A, 2, 2), last steps, iterations, worst step of each.
@@ -176,9 +176,9 @@ class Lanes:
         bent = np.einsum("nk,lkm,nm->ln", ways, self.common.form, ways) * gain[:, None]
         with np.errstate(divide="ignore"):
             common = np.where(free, np.inf, 1 / np.sqrt(np.maximum(bent, 0.0)))
-        for k, (upper, weight) in self.factors.items():
+        for k, (upper, weight, prior) in self.factors.items():
             most = HELD_TO / np.sqrt(max(variance[k], 1e-300))
-            error[k], common[k] = gain_errors(upper, jones[k], basis, gauge.directions, free, weight, most)
+            error[k], common[k] = gain_errors(upper, jones[k], basis, gauge.directions, free, most, weight, prior)
         sigma = np.sqrt(variance)
         return error * sigma[:, None, None, None], common * sigma[:, None]
 

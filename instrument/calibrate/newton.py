@@ -35,7 +35,7 @@ class Side(Protocol):
     settings: Any
     total: Float
     common: CommonPart
-    factors: dict[int, tuple[Float, float]]
+    factors: dict[int, tuple[Float, float, Float]]
 
     def cost(self, jones: Complex, right: Float, left: Float) -> Float:
         """Power left over, relative to that of the data (L,)."""
@@ -72,7 +72,7 @@ def solved_together(lanes: Side, jones: Complex) -> tuple[Complex, Float, Int, F
         history.append(float(np.nanmax(step, initial=0.0)))
         if not np.any(step > lanes.settings.tolerance):
             break
-    lanes.factors = {k: (one.factor, one.weight) for k, one in enumerate(solves) if one.factor is not None}
+    lanes.factors = {k: (one.factor, one.weight, one.prior) for k, one in enumerate(solves) if one.factor is not None}
     return jones, step, count, np.array(history)
 
 
@@ -212,6 +212,7 @@ class _Lane:
         free = self.together[common.free[k]]
         size = np.maximum((free**2 * self.own).sum(axis=1), 1e-300)[:, None]
         weight = common.weight[k] + FLOOR * common.total[k]
+        self.prior = np.sqrt(common.weight[k]) * prior
         rows = np.concatenate([np.sqrt(weight) * prior, free * self.own / np.sqrt(size)])
         upper = blas.dsyrk(1.0, rows.T, beta=1.0, c=normal.T, overwrite_c=1)  # of the transpose: normal is row by row
         diagonal *= 1 + self.damping

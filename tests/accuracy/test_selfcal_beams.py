@@ -202,7 +202,7 @@ def test_errors_are_those_of_the_inverse():
     normal = normal + np.tril(normal, -1).T + 1e-3 * np.eye(len(normal))
     upper, directions = np.asfortranarray(cholesky(normal)), GENERATORS["full"]
     free = np.arange(8) < 3
-    error, common = gain_errors(upper, jones, BASIS["full"], directions, free, 0.0, 1e9)
+    error, common = gain_errors(upper, jones, BASIS["full"], directions, free, 1e9, 0.0, np.zeros((0, 40)))
     turn = np.zeros(normal.shape)
     for k, unit in enumerate(np.eye(len(normal))):
         turn[:, k] = (jones @ unit.view(complex).reshape(jones.shape)).copy().view(float).ravel()
