@@ -13,7 +13,7 @@ import numpy as np
 from instrument.calibrate.cluster_common import Common
 from instrument.calibrate.cluster_data import Block
 from instrument.calibrate.cluster_equations import Equations, conjugate_gradients, dot
-from instrument.calibrate.gauge import BLIND
+from instrument.calibrate.gauge import BLIND, common_form, second_moment
 from instrument.units import Complex, Float
 
 HELD = 4  # first rounds, in which each station is solved with the others held, and goes half the way
@@ -25,6 +25,7 @@ SLOW = 0.3  # a step that is longer than this part of the last: Gauss and Newton
 FAR = 0.3  # relative step beyond which the start is not yet one that anything is to be held near
 LEAST = 0.01  # damping, relative to the equations of each station, after a step that made things worse
 MILD, MOST = 1e-4, 1.0  # damping against negative curvature
+PLAIN = 1e-3  # of the power of a model that a common direction changes: more is seen as any other
 SILENT = 5e-16  # sums, by what the steps of stations held would gain of the rms of the data, that are rounding
 ROUNDING = 1e-14  # of the rms of the data, and of the cost: less is no rise
 
@@ -51,6 +52,7 @@ class Rounds:
     def __post_init__(self) -> None:
         self.z, self.left = self.block.seen(self.x)
         self.power = self.block.cost(self.block.v, self.block.w)
+        self.free = free_directions(self.block)
 
     def run(self) -> None:
         """Rounds until nothing moves, or there have been enough."""
@@ -71,7 +73,7 @@ class Rounds:
             self.start, self.near = self.x, common
         variance = block.variance(self.left, equations.weight)
         self.prior = min(self.prior, variance / TAU**2)
-        system = System(equations, common, self.near, self.prior, self.damping, self.shift)
+        system = System(equations, common, self.near, self.free, self.prior, self.damping, self.shift)
         right = gradient - self.prior * equations.within(self.near.spread(self.near.coordinates(self.x - self.start)))
         slow = len(self.history) > HELD + 1 and self.history[-1] > SLOW * self.history[-2]
         held = equations.held(right)
@@ -122,9 +124,10 @@ class System:
     """The equations of one round with the prior, (H + damping D + prior W^T W) d = right, W the common coordinates."""
 
     def __init__(
-        self, equations: Equations, common: Common, near: Common, prior: float, damping: float, shift: float
-    ) -> None:
-        self.equations, self.common, self.near = equations, common, near
+        self, equations: Equations, common: Common, near: Common, free: Float | None,
+        prior: float, damping: float, shift: float,
+    ) -> None:  # fmt: skip
+        self.equations, self.common, self.near, self.free = equations, common, near, free
         self.prior, self.least, self.shift = prior, damping, shift
 
     @property
@@ -145,13 +148,15 @@ class System:
 
         What no data and no prior see is left as it is: rounding would fill it.
         """
-        coarse, dark = self._coarse(curvature)
+        coarse, dark = self._coarse(curvature) if self.free is None else (None, self._basis(self.free))
 
         def lit(values: Complex) -> Complex:
             flat = np.ascontiguousarray(values).reshape(-1).view(float)
             return (flat - dark @ (flat @ dark)).view(complex).reshape(values.shape) if dark.size else values
 
         def near(rest: Complex) -> Complex:
+            if coarse is None:
+                return lit(self.equations.held(rest))
             y = coarse @ self.common.against(rest).ravel()
             return lit(self.equations.held(rest) + self.common.along(y.reshape(len(self.common.tangents), -1)))
 
@@ -180,10 +185,37 @@ class System:
         values, vectors = np.linalg.eigh((form + form.T) / 2 / root[:, None] / root)
         seen = np.abs(values) > BLIND
         turned = vectors / root[:, None]
-        unseen = [self.common.along(y.reshape(columns, many)) for y in turned[:, ~seen].T]
-        dark = np.array([np.ascontiguousarray(d).reshape(-1).view(float) for d in unseen])
-        basis = np.linalg.qr(dark.T)[0] if len(dark) else np.zeros((0, 0))
-        return np.asarray((turned[:, seen] / np.abs(values[seen])) @ turned[:, seen].T), basis
+        unseen = turned[:, ~seen].T.reshape(-1, columns, many)
+        return np.asarray((turned[:, seen] / np.abs(values[seen])) @ turned[:, seen].T), self._basis(unseen)
+
+    def _basis(self, unseen: Float) -> Float:
+        """Orthonormal steps (8 A K, q) along common directions (q, K, n)."""
+        if not len(unseen):
+            return np.zeros((0, 0))
+        steps = [np.ascontiguousarray(self.common.along(y)).reshape(-1).view(float) for y in unseen]
+        return np.asarray(np.linalg.qr(np.array(steps).T)[0])
+
+
+def free_directions(block: Block) -> Float | None:
+    """Common directions (q, K, n) that the models leave free; None where they hardly show others.
+
+    Without those nothing is gained by solving for common directions apart, and that costs as much as all else.
+    """
+    moments = np.zeros((block.columns, 4, 4), complex)
+    for p, col in enumerate(block.column):
+        for c, k in enumerate(col):
+            moments[k] += second_moment(block.models[c, p].reshape(-1, 2, 2), block.weight[p].reshape(-1))
+    power = np.einsum("kii->k", moments).real
+    flux = power > 0
+    values, vectors = np.linalg.eigh(common_form(moments, block.limits.pattern))
+    share = values / np.where(flux, power, 1.0)[:, None]
+    if np.any((share > BLIND) & (share < PLAIN)):
+        return None
+    out = [(k, vectors[k][:, n]) for k, n in zip(*np.nonzero((share <= BLIND) & flux[:, None]), strict=True)]
+    free = np.zeros((len(out), block.columns, vectors.shape[-1]))
+    for row, (k, y) in zip(free, out, strict=True):
+        row[k] = y
+    return free
 
 
 def relative(step: Complex, x: Complex) -> float:
