@@ -29,7 +29,8 @@ from instrument.visibilities import Visibilities
 
 HARD = 18.0  # times the sweeps of a solve where much of the sky is not in the model
 SHELLS = 4.0  # times the seconds of a prediction where it is made in parts
-DIRECTIONAL = 1.4e-6  # seconds of a visibility and a pair of directions, solved for all directions at once
+DIRECTIONAL = 3e-6  # seconds of a visibility and a pair of directions, solved for all directions at once, with errors
+THROUGH_BEAMS = 4.0  # times that, where only the polarization that beams add shows what is common to all stations
 
 
 def _common(beside: Beside) -> dict[str, Any]:
@@ -99,7 +100,8 @@ class ManyDirectionsStage(Stage):
     def work(self, run: Running) -> StageWork:
         """Predictions, solves in all directions and in one, and what they leave, in blocks of 64 MB of models."""
         lab, problem = self.laboratory, run.plan.problem
-        solves = DIRECTIONAL * run.visibilities * lab.clusters**2
+        harder = THROUGH_BEAMS if problem.chain.beams().terms else 1.0
+        solves = DIRECTIONAL * harder * run.visibilities * lab.clusters**2
         return StageWork(
             f"solves of {problem.at.shape[2]} stations in {lab.clusters} directions",
             seconds=solves + solving(lab.calibrator.tolerance, run).seconds + 1.3 * run.plan.seconds,
