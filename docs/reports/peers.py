@@ -2,12 +2,14 @@
 
 import importlib.util
 import os
+import re
 import subprocess
 import tempfile
 import time
 from importlib.metadata import files
 from pathlib import Path
 
+QUIET = {"OPENBLAS_NUM_THREADS": "1"}
 DP3 = "from dp3 import entrypoint; import sys; sys.exit(entrypoint())"
 
 
@@ -25,19 +27,55 @@ def peer_tools(folder):
     return module
 
 
-def timed(command, environment):
-    """Wall seconds and peak memory in MB of a process."""
+def process(command, environment):
+    """Wall seconds, peak memory in MB, processor seconds and all that was said by a process."""
     begin = time.perf_counter()
     with tempfile.TemporaryFile() as said:
         child = subprocess.Popen(command, env=environment, stdout=said, stderr=subprocess.STDOUT)
         _, status, used = os.wait4(child.pid, 0)
+        wall = time.perf_counter() - begin
         child.returncode = os.waitstatus_to_exitcode(status)
         said.seek(0)
-        assert child.returncode == 0, said.read().decode()[-2000:]
-    return time.perf_counter() - begin, used.ru_maxrss / 1e3
+        text = said.read().decode(errors="replace")
+    assert child.returncode == 0, text[-2000:]
+    return wall, used.ru_maxrss / 1e3, used.ru_utime + used.ru_stime, text
+
+
+def timed(command, environment):
+    """Wall seconds and peak memory in MB of a process."""
+    return process(command, environment)[:2]
 
 
 def everybeam_data():
     """Folder of the coefficients that the everybeam package carries."""
     found = next(f for f in files("everybeam") if f.name == "HamakerHBACoeff.h5")
     return str(Path(found.locate()).resolve().parent)
+
+
+def measured(ways, runs, error, count):
+    """Best (wall s, processor s, processor ms a solution beyond the first), error and converged by way, in turn.
+
+    What takes more than 10 s is run once.
+    """
+    found = {}
+    for run in range(runs):
+        for name, (whole, first) in ways.items():
+            best, value, converged = found.get(name, ((float("inf"),) * 3, None, "?"))
+            if run and best[0] > 10:
+                continue
+            begun = process(first, QUIET | os.environ)[2]
+            wall, _, spent, said = process(whole, QUIET | os.environ)
+            told = re.search(r"[Cc]onverged: *(\d+)", said)
+            best = tuple(map(min, best, (wall, spent, 1e3 * (spent - begun) / (count - 1))))
+            found[name] = best, error(name) if run == 0 else value, told.group(1) if told else converged
+            print(name, *found[name], flush=True)
+    return found
+
+
+def row_of(case, name, found, count):
+    (wall, spent, one), value, converged = found
+    return f"| {case} | {name} | {value:.1e} | {converged} of {count} | {one:.1f} | {spent:.1f} | {wall:.1f} |"
+
+
+HEAD = """| case | solver, tolerance | error | converged | ms a solution | processor s | wall s |
+|---|---|---|---|---|---|---|"""
