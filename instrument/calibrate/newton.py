@@ -195,9 +195,8 @@ class _Lane:
         idle = common.free[k] | (common.weak[k] & (np.abs(along) < ROUNDING * common.total[k]))
         if not idle.any():
             return gradient
-        rows = self.together[idle]
-        spread = rows * self.own
-        return np.asarray(gradient - spread.T @ (np.linalg.pinv(spread @ rows.T, hermitian=True) @ along[idle]))
+        shares = np.linalg.pinv(self.metric[np.ix_(idle, idle)], hermitian=True) @ along[idle]
+        return np.asarray(gradient - (shares @ self.together[idle]) * self.own)
 
     def _factored(self, jones: Complex) -> None:
         """Cholesky factors of the normal matrix with the prior, the gauge and the damping."""
@@ -209,6 +208,7 @@ class _Lane:
         prior = (self.moves.reshape(-1, len(jones), 8) @ self.basis).reshape(-1, len(normal))
         self.own = diagonal.copy()
         # what the model does not see stays where it is; through one direction the data see less than common matrices
+        self.metric = (self.together * self.own) @ self.together.T
         free = self.together[common.free[k]]
         size = np.maximum((free**2 * self.own).sum(axis=1), 1e-300)[:, None]
         weight = common.weight[k] + FLOOR * common.total[k]
