@@ -60,6 +60,18 @@ def inverse(a: Complex) -> Complex:
     return out
 
 
+def exponential(matrix: Complex) -> Complex:
+    """exp of matrices (..., 2, 2) in closed form: exp(t) (cosh(d) 1 + sinh(d) / d H), t half the trace, H the rest."""
+    half = (matrix[..., 0, 0] + matrix[..., 1, 1]) / 2
+    rest = matrix - half[..., None, None] * IDENTITY
+    d = np.sqrt(-det(rest) + 0j)
+    far = np.abs(d) > 1e-5
+    ratio = np.where(far, np.sinh(d) / np.where(far, d, 1.0), 1 + d * d / 6)
+    return np.asarray(
+        np.exp(half)[..., None, None] * (np.cosh(d)[..., None, None] * IDENTITY + ratio[..., None, None] * rest)
+    )
+
+
 def singular_values(a: Complex) -> tuple[Float, Float]:
     """Largest and smallest singular value, (...), in closed form; NaN where the matrix is not finite."""
     # scaled by its largest entry: the fourth powers below leave float64 at 1e-81 and 1e77

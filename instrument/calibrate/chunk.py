@@ -13,6 +13,7 @@ from instrument.calibrate.fit import strange
 from instrument.calibrate.gauge import UNKNOWNS, Gauge, common, free_counts
 from instrument.calibrate.graph import counted, freedom, tied
 from instrument.calibrate.lanes import Lanes, Settings
+from instrument.calibrate.newton import factored
 from instrument.calibrate.suspects import suspects
 from instrument.errors import Outcome
 from instrument.jones.base import JonesTerm
@@ -105,8 +106,8 @@ class Job:
         # J^-1 magnifies what is left over: by its condition number for either station
         with np.errstate(invalid="ignore"):
             worst = fit.left.worst * np.median(np.where(held, mat2.condition(jones), 1.0), axis=1) ** 2
-        for other in np.flatnonzero(hard).tolist():  # solved from another start since
-            lanes.factors.pop(other, None)
+        # solved from another start since
+        factored(lanes, fit.jones, fit.left.share, [k for k in np.flatnonzero(hard).tolist() if k in lanes.factors])
         named = {int(np.flatnonzero(failed)[k]): mask for k, mask in found.items()}
         lost = np.array([o is not Outcome.CONVERGED for o in outcome])
         jones, error, common_error = _with_errors(lanes, fit, lost, self.gauge)

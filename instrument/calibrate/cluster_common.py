@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from instrument import mat2
 from instrument.calibrate.cluster_equations import Equations
 from instrument.calibrate.gauge import GENERATORS
 from instrument.units import Complex, Float
@@ -49,7 +50,7 @@ class Common:
     def moved(self, x: Complex, step: Complex) -> Complex:
         """Matrices x after a step: what is not common in a straight line, what is as an exponential."""
         y = self.coordinates(step)
-        common = exponential(np.einsum("kn,nij->kij", y, self.generators))
+        common = mat2.exponential(np.einsum("kn,nij->kij", y, self.generators))
         return np.asarray(np.einsum("aikj,kjl->aikl", x + (step - self.along(y)), common))
 
     def prior_form(self, other: Common) -> Float:
@@ -100,13 +101,3 @@ class Common:
         out = np.zeros((columns, many, columns, many))
         out[range(columns), :, range(columns)] = (steps.conj() @ curvature @ steps.swapaxes(1, 2)).real
         return out.reshape(columns * many, -1)
-
-
-def exponential(matrix: Complex) -> Complex:
-    """exp of matrices (..., 2, 2)."""
-    half = np.einsum("...ii->...", matrix)[..., None, None] / 2
-    rest = matrix - half * np.eye(2)  # its square is s^2 times the identity
-    s = np.sqrt(-(rest[..., 0, 0] * rest[..., 1, 1] - rest[..., 0, 1] * rest[..., 1, 0]))[..., None, None]
-    small = np.abs(s) < 1e-4  # the next term of the series is 1e-16
-    ratio = np.where(small, 1 + s**2 / 6, np.sinh(s) / np.where(small, 1.0, s))
-    return np.asarray(np.exp(half) * (np.cosh(s) * np.eye(2) + ratio * rest))

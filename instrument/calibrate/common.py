@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from instrument import mat2
 from instrument.calibrate.gauge import BLIND, GENERATORS, HELD_TO, UNKNOWNS, common_form, second_moment
 from instrument.units import Bool, Complex, Float, Int
 
@@ -67,15 +66,3 @@ class CommonPart:
         hidden = self.eigen[1][lane][:, self.weak[lane] | self.free[lane]]
         y = np.einsum("nij,ij->n", self.generators.conj(), mean).real / 2
         return step - np.einsum("n,nij->ij", hidden @ (hidden.T @ y), self.generators)
-
-
-def exponential(matrix: Complex) -> Complex:
-    """exp of matrices (..., 2, 2) in closed form: exp(t) (cosh(d) 1 + sinh(d) / d H), t half the trace, H the rest."""
-    half = (matrix[..., 0, 0] + matrix[..., 1, 1]) / 2
-    rest = matrix - half[..., None, None] * mat2.IDENTITY
-    d = np.sqrt(-mat2.det(rest) + 0j)
-    far = np.abs(d) > 1e-5
-    ratio = np.where(far, np.sinh(d) / np.where(far, d, 1.0), 1 + d * d / 6)
-    return np.asarray(
-        np.exp(half)[..., None, None] * (np.cosh(d)[..., None, None] * mat2.IDENTITY + ratio[..., None, None] * rest)
-    )

@@ -10,11 +10,11 @@ from typing import Any, Protocol
 import numpy as np
 
 from instrument.calibrate.base import Solution, by_baseline, partly_known
+from instrument.calibrate.chunk import SolveSettings
 from instrument.calibrate.cluster_data import Block, Limits
 from instrument.calibrate.clusters import Found, solved, suspects
 from instrument.calibrate.gauge import GENERATORS, Gauge, gauge_of
 from instrument.errors import InputError, Outcome
-from instrument.jones.base import JonesTerm
 from instrument.jones.table import JonesTable
 from instrument.units import Bool, Complex, Float, Int
 from instrument.visibilities import Visibilities
@@ -22,36 +22,16 @@ from instrument.visibilities import Visibilities
 FAINT = 0.3  # standard error per element beyond which matrices of a cluster are noise
 
 
-class SolveSettings(Protocol):
+class BlockSettings(SolveSettings, Protocol):
     """What the blocks need to know of a solver."""
-
-    @property
-    def pattern(self) -> str:
-        """Pattern of the matrices."""
-
-    @property
-    def tolerance(self) -> float:
-        """Relative step at which nothing moves any more."""
-
-    @property
-    def iterations(self) -> int:
-        """Most rounds."""
 
     @property
     def robust(self) -> float | None:
         """Degrees of freedom of Student's t."""
 
     @property
-    def unexplained(self) -> float:
-        """Share of the rms of the data above which what is left is a poor fit."""
-
-    @property
     def channels(self) -> int:
         """Of one solution."""
-
-    @property
-    def start(self) -> JonesTerm | None:
-        """What to start from."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +87,7 @@ class Part:
 class Job:
     """What all blocks of one solve share."""
 
-    settings: SolveSettings
+    settings: BlockSettings
     data: Visibilities
     models: Complex
     weight: Float

@@ -179,6 +179,7 @@ class Lanes:
             common = np.where(free, np.inf, 1 / np.sqrt(np.maximum(bent, 0.0)))
         for k, (upper, weight, prior) in self.factors.items():
             if share[k] <= EXACT:  # no noise to make errors: 3 ms for numbers that nobody needs
+                common[k, gauge.count :] = np.nan
                 continue
             most = HELD_TO / np.sqrt(max(variance[k], 1e-300))
             error[k], common[k] = gain_errors(upper, jones[k], basis, gauge.directions, free, most, weight, prior)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, Protocol
 
 import numpy as np
@@ -9,7 +10,7 @@ from scipy.linalg import blas, lapack
 
 from instrument import mat2
 from instrument.calibrate.als import LANES, matrices, planar, power_of, solve_stations, sweep, unit_diagonal
-from instrument.calibrate.common import CommonPart, exponential
+from instrument.calibrate.common import CommonPart
 from instrument.calibrate.normal import BASIS, normal_matrix
 from instrument.units import Bool, Complex, Float, Int
 
@@ -76,6 +77,17 @@ def solved_together(lanes: Side, jones: Complex) -> tuple[Complex, Float, Int, F
     return jones, step, count, np.array(history)
 
 
+def factored(lanes: Side, jones: Complex, share: Float, which: Iterable[int]) -> None:
+    """Puts into lanes the factors of some of them at matrices (L, A, 2, 2) that were found another way."""
+    lanes.common.begin(jones)
+    for k in which:
+        lane = _Lane(lanes, k)
+        lanes.common.weigh(k, float(share[k]) ** 2)
+        lane.moves = lanes.common.moves(k, jones[k])
+        lane.factor_at(jones[k])
+        lanes.factors[k] = (lane.factor, lane.weight, lane.prior)
+
+
 class _Sums:
     """The sums of a sweep over all lanes, and what is made of them."""
 
@@ -119,7 +131,7 @@ class _Lane:
         return (each.reshape(len(found), -1, 8) @ np.linalg.pinv(self.basis).T).reshape(len(found), -1)
 
     def next(self, jones: Complex, share: float, left_over: Complex, new: Complex) -> tuple[Complex, float]:
-        """The next matrices (A, 2, 2), and how long the step is: infinite where it was damped or taken back."""
+        """The next matrices (A, 2, 2), and how long the step is; never short enough where it was damped."""
         unsolved = self.active & ~np.isfinite(new).all(axis=(-2, -1))
         if unsolved.any():
             self.far = False
@@ -148,20 +160,20 @@ class _Lane:
         jones, left_over, new, y = self.best
         gradient = self._gradient(jones, left_over, y)
         if self.factor is None or self.weight - weight > 0.5 * (weight + self.weakest):
-            self._factored(jones)
+            self.factor_at(jones)
         step, gained = self._step(jones, gradient)
         length = self._length(jones, step, gained)
         # what the data see once the stations follow may be far less than `weakest`: no end with a prior of before
         stale = length <= self.lanes.settings.tolerance and self.weight > 2 * weight + FLOOR * common.total[k]
         if (length > AGAIN * self.last or stale) and not self.fresh:
-            self._factored(jones)
+            self.factor_at(jones)
             step, gained = self._step(jones, gradient)
             length = self._length(jones, step, gained)
         self.last, self.fresh = length, False
         # within the noise what is left over bends as much as the fit does
         self.within = gained**2 * common.freedom[k] < share * common.unknowns[k]
         size = float(np.sqrt((np.abs(step) ** 2).sum(axis=(-2, -1))).max(initial=0.0))
-        turned = jones @ exponential(step * min(1.0, 1.0 / max(size, 1e-300)))
+        turned = jones @ mat2.exponential(step * min(1.0, 1.0 / max(size, 1e-300)))
         odd = self.active & (np.abs(mat2.det(jones)) <= 1e-3 * power_of(jones))
         turned = np.where(odd[:, None, None], new, turned)
         if odd.any():
@@ -198,7 +210,7 @@ class _Lane:
         shares = np.linalg.pinv(self.metric[np.ix_(idle, idle)], hermitian=True) @ along[idle]
         return np.asarray(gradient - (shares @ self.together[idle]) * self.own)
 
-    def _factored(self, jones: Complex) -> None:
+    def factor_at(self, jones: Complex) -> None:
         """Cholesky factors of the normal matrix with the prior, the gauge and the damping."""
         common, k = self.lanes.common, self.k
         v, m = (x[k] for x in self.lanes.products)
@@ -225,7 +237,7 @@ class _Lane:
         ):  # on a slope that bends down, or singular: the fit alone, or held by what rounding leaves
             self.damping = self.damping if second is not None else max(10 * self.damping, 1e-8)
             self.within = False
-            self._factored(jones)
+            self.factor_at(jones)
 
     def _step(self, jones: Complex, gradient: Float) -> tuple[Complex, float]:
         """The step e (A, 2, 2), and what the data could gain by it in their rms."""
