@@ -10,8 +10,8 @@ import pytest
 from astropy import units as u
 
 import instrument
-from instrument import JonesTable, Observation, Outcome, PointSky, Scene
-from instrument.calibrate.cluster_common import Common, exponential
+from instrument import JonesTable, Observation, Outcome, PointSky, Scene, mat2
+from instrument.calibrate.cluster_common import Common
 from instrument.calibrate.cluster_data import Block, Limits
 from instrument.calibrate.cluster_equations import Equations
 from instrument.calibrate.cluster_errors import errors_of, normal_matrix
@@ -358,9 +358,11 @@ def test_exponentials_of_matrices():
 
     drawn = np.random.default_rng(1).normal(size=(20, 2, 2, 2)).view(complex)[..., 0]
     for size in (1.0, 1e-3, 1e-6, 0.0):
-        assert np.abs(exponential(size * drawn) - expm(size * drawn)).max() < 1e-13 * np.abs(expm(size * drawn)).max()
+        assert (
+            np.abs(mat2.exponential(size * drawn) - expm(size * drawn)).max() < 1e-13 * np.abs(expm(size * drawn)).max()
+        )
     nilpotent = np.array([[0, 1], [0, 0]], complex)
-    assert np.array_equal(exponential(nilpotent), np.eye(2) + nilpotent)
+    assert np.array_equal(mat2.exponential(nilpotent), np.eye(2) + nilpotent)
 
 
 def test_a_solution_of_an_interval_without_weak_directions_stays_so():
