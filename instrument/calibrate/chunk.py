@@ -106,10 +106,11 @@ class Job:
         # J^-1 magnifies what is left over: by its condition number for either station
         with np.errstate(invalid="ignore"):
             worst = fit.left.worst * np.median(np.where(held, mat2.condition(jones), 1.0), axis=1) ** 2
-        # solved from another start since
-        factored(lanes, fit.jones, fit.left.share, [k for k in np.flatnonzero(hard).tolist() if k in lanes.factors])
         named = {int(np.flatnonzero(failed)[k]): mask for k, mask in found.items()}
         lost = np.array([o is not Outcome.CONVERGED for o in outcome])
+        lanes.factors = {k: one for k, one in lanes.factors.items() if not lost[k]}
+        # solved from another start since
+        factored(lanes, fit.jones, fit.left.share, [k for k in np.flatnonzero(hard).tolist() if k in lanes.factors])
         jones, error, common_error = _with_errors(lanes, fit, lost, self.gauge)
         scale = level[:, None, None, None]
         share, gains = fit.left.share, jones * scale
