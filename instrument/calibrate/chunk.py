@@ -13,7 +13,7 @@ from instrument.calibrate.fit import strange
 from instrument.calibrate.gauge import UNKNOWNS, Gauge, common, free_counts
 from instrument.calibrate.graph import counted, freedom, tied
 from instrument.calibrate.lanes import Lanes, Settings
-from instrument.calibrate.newton import factored
+from instrument.calibrate.newton import MOVED, factored
 from instrument.calibrate.suspects import suspects
 from instrument.errors import Outcome
 from instrument.jones.base import JonesTerm
@@ -33,6 +33,14 @@ class SolveSettings(Settings, Protocol):
     @property
     def start(self) -> JonesTerm | None:
         """What to start from."""
+
+
+class SelfSettings(SolveSettings, Protocol):
+    """What a chunk of a self-calibration needs to know besides."""
+
+    @property
+    def errors(self) -> bool:
+        """Whether errors of gains are wanted."""
 
 
 @dataclass
@@ -55,7 +63,7 @@ class Part:
 class Job:
     """What all chunks of one solve share."""
 
-    settings: SolveSettings
+    settings: SelfSettings
     visibilities: Visibilities
     data: Complex
     model: Complex
@@ -109,9 +117,8 @@ class Job:
         named = {int(np.flatnonzero(failed)[k]): mask for k, mask in found.items()}
         lost = np.array([o is not Outcome.CONVERGED for o in outcome])
         lanes.factors = {k: one for k, one in lanes.factors.items() if not lost[k]}
-        # solved from another start since
-        factored(lanes, fit.jones, fit.left.share, [k for k in np.flatnonzero(hard).tolist() if k in lanes.factors])
-        jones, error, common_error = _with_errors(lanes, fit, lost, self.gauge)
+        factored(lanes, fit.jones, fit.left.share, np.flatnonzero(hard).tolist(), MOVED if s.errors else np.inf)
+        jones, error, common_error = _with_errors(lanes, fit, lost, self.gauge, s.errors)
         scale = level[:, None, None, None]
         share, gains = fit.left.share, jones * scale
         return Part(gains, outcome, fit.count, share, worst, history, gauges, named, error * scale, common_error)
@@ -184,10 +191,10 @@ class Job:
         return every > alike
 
 
-def _with_errors(lanes: Lanes, fit: Fits, lost: Any, gauge: Gauge) -> tuple[Complex, Float, Float]:
+def _with_errors(lanes: Lanes, fit: Fits, lost: Any, gauge: Gauge, each: bool) -> tuple[Complex, Float, Float]:
     """Matrices, their errors (L, A, 2, 2) and those of common directions (L, n); NaN where there is no solution."""
     jones = fit.jones
-    error, common_error = lanes.errors(jones, fit.left.share, gauge)
+    error, common_error = lanes.errors(jones, fit.left.share, gauge, each)
     jones[lost] = error[lost] = common_error[lost] = np.nan
     jones[~lanes.active] = error[~lanes.active] = np.nan
     return jones, error, common_error

@@ -31,38 +31,34 @@ class CommonPart:
         power = np.where(self.model_power > 0, self.model_power, 1.0)[:, None]
         self.free, below = self.eigen[0] <= BLIND * power, self.eigen[0] <= WEAK * power
         self.weak = below & ~self.free
+        # onto those that data hardly see
+        self.hidden = np.einsum("lik,lk,ljk->lij", self.eigen[1], below | self.free, self.eigen[1])
 
     def begin(self, start: Complex) -> None:
         """Hold the common directions near matrices (L, A, 2, 2)."""
         self.start = start.copy()
-        self.tangents = np.einsum("laij,njk->lnaik", start, self.generators)
-        flat = self.tangents.reshape(*self.form.shape[:2], -1)
+        tangents = np.einsum("laij,njk->lnaik", start, self.generators)
+        flat = tangents.reshape(*self.form.shape[:2], -1)
         gram = (flat.conj() @ np.swapaxes(flat, 1, 2)).real
         size = np.trace(gram, axis1=1, axis2=2)[:, None, None]
         gram = gram / np.where(size > 0, size, 1.0) + 1e-12 * np.eye(gram.shape[1])
-        self.back = np.where(size > 0, np.linalg.inv(gram) / np.where(size > 0, size, 1.0), 0.0)
+        back = np.where(size > 0, np.linalg.inv(gram) / np.where(size > 0, size, 1.0), 0.0)
+        # y of J is the real part of sum conj(tangents) (J - start)
+        self.tangents = (back @ flat).reshape(tangents.shape)
         self.weight = np.full(len(start), np.inf)
 
     def moved(self, lane: int, jones: Complex) -> Float:
         """How far matrices (A, 2, 2) of a lane have gone from the start along each common direction, y (n,)."""
-        apart = (self.tangents[lane].conj() * (jones - self.start[lane])).real.sum(axis=(1, 2, 3))
-        return np.asarray(self.back[lane] @ apart)
+        apart = (jones - self.start[lane]).reshape(-1)
+        return np.asarray((self.tangents[lane].reshape(-1, len(apart)).conj() @ apart).real)
 
     def moves(self, lane: int, jones: Complex) -> Float:
         """What steps J_a exp(e_a) of (A, 2, 2) do to `moved` of a lane, (n, 8 A): re, im of e00, e01, e10, e11."""
-        each = np.einsum("naik,aij->najk", self.tangents[lane].conj(), jones)
-        return self.back[lane] @ np.stack([each.real, -each.imag], axis=-1).reshape(len(each), -1)
+        each = np.conj(np.swapaxes(jones, 1, 2)) @ self.tangents[lane]
+        return np.ascontiguousarray(each).reshape(len(each), -1).view(float)
 
     def weigh(self, lane: int, share: float) -> float:
         """The weight of the prior of a lane, lowered to what a share of the data's power that is left makes of it."""
         found = max(share, 0.0) * self.total[lane] / self.freedom[lane] / HELD_TO**2
         self.weight[lane] = min(self.weight[lane], found)
         return float(self.weight[lane])
-
-    def seen(self, lane: int, step: Complex) -> Complex:
-        """Steps e (A, 2, 2) of a lane without what is common to all along directions that the data hardly see."""
-        use = self.active[lane]
-        mean = step[use].mean(axis=0) if use.any() else np.zeros((2, 2))
-        hidden = self.eigen[1][lane][:, self.weak[lane] | self.free[lane]]
-        y = np.einsum("nij,ij->n", self.generators.conj(), mean).real / 2
-        return step - np.einsum("n,nij->ij", hidden @ (hidden.T @ y), self.generators)

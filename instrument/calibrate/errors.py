@@ -5,61 +5,64 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import lapack
 
+from instrument.calibrate.factor import Factor
 from instrument.units import Bool, Complex, Float
 
 
 def gain_errors(
-    upper: Float,
-    jones: Complex,
-    basis: Float,
-    directions: Complex,
-    free: Bool,
-    most: float,
-    weight: float,
-    prior: Float,
+    factor: Factor, jones: Complex, basis: Float, directions: Complex, free: Bool, most: float, each: bool = True
 ) -> tuple[Float, Float]:
     """Of every gain (A, 2, 2) and along common `directions` (n, 2, 2), for noise of variance 1 per real number.
 
-    upper (A k, A k) is R of the normal matrix R^T R of steps jones_a exp(e_a), jones (A, 2, 2), basis (8, k) their real
-    coordinates. That of a direction is of y in exp(sum_k y_k G_k), as the data alone have it without a prior of this
-    weight, and infinite where it is `free` (n,). That of a gain is the rms of its real and its imaginary part, without
-    what it has along directions that are free or whose error is above `most`. `prior` (m, A k) are its rows, P^T P of
-    the normal matrix: what it pulls is no noise, the covariance is A - A P^T P A for A the inverse.
+    factor of the normal matrix of steps jones_a exp(e_a), whose R is used up; jones (A, 2, 2), basis (8, k) their real
+    coordinates. That of a direction is of y in exp(sum_k y_k G_k), as the data alone have it without a prior, and
+    infinite where it is `free` (n,). That of a gain is the rms of its real and its imaginary part, without what it has
+    along directions that are free or whose error is above `most`; NaN unless `each`. What a prior P of weight w pulls
+    is no noise: the covariance is A - w A P^T P A for A the inverse.
     """
     stations, size = len(jones), basis.shape[1]
-    inverse, _ = lapack.dtrtri(upper, lower=0, overwrite_c=0)
+    turn = _left(jones) @ basis  # (A, 8, k): of e to J e
+    tangents = np.einsum("aij,njk->naik", jones, directions).reshape(len(directions), stations, 4)
+    real = np.ascontiguousarray(tangents).view(float)  # (n, A, 8)
+    right = np.einsum("nax,axk->nak", real, turn).reshape(len(directions), -1)
+    along = np.einsum("nak,axk->nax", factor.solve(right.T).T.reshape(len(right), stations, size), turn)
+    flat = real.reshape(len(right), -1)
+    gram = flat @ flat.T
+    back = np.linalg.pinv(gram, hermitian=True)
+    common = back @ flat @ along.reshape(len(right), -1).T @ back
+    along_each = np.maximum(np.diagonal(common), 0.0)
+    with np.errstate(divide="ignore"):
+        held = np.maximum(1 - factor.now * along_each, 1e-300)
+        alone = np.where(held > 1e-9, along_each / held, np.inf)
+    alone = np.where(free, np.inf, alone)
+    if not each:
+        return np.full(jones.shape, np.nan), np.sqrt(alone)
+    variance = ((turn @ _own_blocks(factor, stations)) * turn).sum(axis=2)
+    # what a prior adds to the inverse as it weakens, and what it pulls
+    grown = factor.grown()
+    beside = np.einsum("akn,axk->nax", factor.back.reshape(stations, size, -1), turn)
+    pulled = factor.now * grown**2
+    variance += np.einsum("n,nax->ax", (factor.weight - factor.now) * grown - pulled, beside**2)
+    along = along - np.einsum("nm,max->nax", right @ factor.back * pulled, beside)
+    both = flat @ along.reshape(len(right), -1).T
+    few = alone > most**2
+    near = np.linalg.pinv(gram[np.ix_(few, few)], hermitian=True)
+    once = (real[few] * np.tensordot(near, along[few], 1)).sum(axis=0)
+    twice = (real[few] * np.tensordot(near @ both[np.ix_(few, few)] @ near, real[few], 1)).sum(axis=0)
+    variance = np.maximum(variance - 2 * once + twice, 0.0).reshape(stations, 2, 2, 2).mean(axis=3)
+    return np.sqrt(variance), np.sqrt(alone)
+
+
+def _own_blocks(factor: Factor, stations: int) -> Float:
+    """Blocks of stations on the diagonal of (R^T R)^-1, (A, k, k)."""
+    inverse, _ = lapack.dtrtri(factor.upper, lower=0, overwrite_c=1)
+    size = len(inverse) // stations
     own, lower = np.empty((stations, size, size)), np.tril_indices(size, -1)
     for a in range(stations):  # below the diagonal nothing was written
         rows = np.array(inverse[a * size : (a + 1) * size, a * size :])
         rows[lower] = 0.0
         own[a] = rows @ rows.T
-    turn = _left(jones) @ basis  # (A, 8, k): of e to J e
-    spread = turn @ own
-    variance = (spread * turn).sum(axis=2)
-    tangents = np.einsum("aij,njk->naik", jones, directions).reshape(len(directions), stations, 4)
-    real = np.ascontiguousarray(tangents).view(float)  # (n, A, 8)
-    right = np.einsum("nax,axk->nak", real, turn).reshape(len(directions), -1)
-    solved = lapack.dpotrs(upper, np.concatenate([right, prior]).T, lower=0)[0].T
-    along = np.einsum("nak,axk->nax", solved.reshape(len(solved), stations, size), turn)
-    along, pulled = along[: len(right)], along[len(right) :]
-    flat = real.reshape(len(right), -1)
-    gram = flat @ flat.T
-    back = np.linalg.pinv(gram, hermitian=True)
-    common = back @ flat @ along.reshape(len(right), -1).T @ back
-    variance = variance - (pulled**2).sum(axis=0)
-    along = along - np.einsum("nm,max->nax", right @ solved[len(right) :].T, pulled)
-    both = flat @ along.reshape(len(right), -1).T
-    along_each = np.maximum(np.diagonal(common), 0.0)
-    with np.errstate(divide="ignore"):
-        held = np.maximum(1 - weight * along_each, 1e-300)
-        alone = np.where(held > 1e-9, along_each / held, np.inf)
-    alone = np.where(free, np.inf, alone)
-    few = alone > most**2
-    near = np.linalg.pinv(gram[np.ix_(few, few)], hermitian=True)
-    once = np.einsum("nax,nm,max->ax", real[few], near, along[few])
-    twice = np.einsum("nax,nm,max->ax", real[few], near @ both[np.ix_(few, few)] @ near, real[few])
-    variance = np.maximum(variance - 2 * once + twice, 0.0).reshape(stations, 2, 2, 2).mean(axis=3)
-    return np.sqrt(variance), np.sqrt(alone)
+    return own
 
 
 def _left(jones: Complex) -> Float:

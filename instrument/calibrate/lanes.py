@@ -9,13 +9,13 @@ import numpy as np
 from instrument.calibrate.als import LANES, matrices, planar, power_of, residual, solve_stations, sweep, unit_diagonal
 from instrument.calibrate.common import CommonPart
 from instrument.calibrate.errors import gain_errors
+from instrument.calibrate.factor import Factor
 from instrument.calibrate.fit import Left
 from instrument.calibrate.gauge import GENERATORS, HELD_TO, Gauge
-from instrument.calibrate.newton import solved_together
+from instrument.calibrate.newton import EXACT, solved_together
 from instrument.calibrate.normal import BASIS
 from instrument.units import Complex, Float, Int
 
-EXACT = 1e-9  # of the rms of the data: what is left where there is no noise, and rounding is all there is
 FAR = 0.3  # relative step above which sweeps are averaged instead of corrected
 DEPTH = 6  # steps that are mixed
 
@@ -53,8 +53,8 @@ class Lanes:
         self.power[:, a1, a2] = power
         self.power += np.swapaxes(self.power, 1, 2)
         self.a1, self.a2, self.active, self.settings = a1, a2, active, settings
-        # of the normal matrices of lanes that were solved together, with the weights of their priors
-        self.factors: dict[int, tuple[Float, float, Float]] = {}
+        # of the normal matrices of lanes that were solved together
+        self.factors: dict[int, Factor] = {}
 
     def iterate(self, jones: Complex, far: float = FAR) -> tuple[Complex, Float, Int, Float]:
         """Sweeps until all lanes stand still: matrices (L, A, 2, 2), last steps, iterations, worst step of each.
@@ -151,11 +151,12 @@ class Lanes:
         gain = weight.sum(axis=(1, 2)) / np.maximum(4 * self.power.sum(axis=(1, 2)), 1e-300) * (1 + damping)
         return plus * scale, minus * scale, share, gain
 
-    def errors(self, jones: Complex, share: Float, gauge: Gauge) -> tuple[Float, Float]:
+    def errors(self, jones: Complex, share: Float, gauge: Gauge, each: bool) -> tuple[Float, Float]:
         """Standard errors of gains (L, A, 2, 2) and of the common directions of a gauge (L, n), for what is left over.
 
         Where all stations were solved at once and noise is left, from their normal matrix; elsewhere as for a model
-        m_ab 1: the two parts of each e_a have the covariance of `_coupling`, and what is free is left out.
+        m_ab 1: the two parts of each e_a have the covariance of `_coupling`, and what is free is left out. Unless
+        `each`, those of gains are NaN.
         """
         free = np.arange(len(gauge.seen)) < gauge.count
         variance = share**2 * self.total / (self.common.freedom + gauge.count)
@@ -169,21 +170,22 @@ class Lanes:
         along = np.einsum("lab,lb->la", whole, q)
         turned = np.einsum("laa->la", whole) - 2 * q * along + q**2 * (q * along).sum(axis=1, keepdims=True)
         grown = np.einsum("laa->la", plus) / np.where(total > 0, total, np.inf) * root**2
-        each = np.maximum(turned + (0 if self.settings.pattern == "phase" else grown), 0.0) / 2
-        each = np.where(total > 0, each / (2 if self.settings.pattern == "scalar" else 1), np.nan)
+        own = np.maximum(turned + (0 if self.settings.pattern == "phase" else grown), 0.0) / 2
+        own = np.where(total > 0, own / (2 if self.settings.pattern == "scalar" else 1), np.nan)
         allowed = (BASIS[self.settings.pattern] != 0).any(axis=1)[::2].reshape(2, 2)
-        error = np.sqrt(each)[..., None, None] * np.where(allowed, 1.0, 0.0)
+        error = np.sqrt(own)[..., None, None] * np.where(allowed, 1.0, 0.0)
         ways = np.einsum("kij,nij->nk", self.common.generators.conj(), gauge.directions).real / 2
         bent = np.einsum("nk,lkm,nm->ln", ways, self.common.form, ways) * gain[:, None]
         with np.errstate(divide="ignore"):
             common = np.where(free, np.inf, 1 / np.sqrt(np.maximum(bent, 0.0)))
-        for k, (upper, weight, prior) in self.factors.items():
-            if share[k] <= EXACT:  # no noise to make errors: 3 ms for numbers that nobody needs
+        for k, factor in self.factors.items():
+            if share[k] <= max(EXACT, self.settings.tolerance):  # no noise that could be told from steps not taken
                 common[k, gauge.count :] = np.nan
                 continue
             most = HELD_TO / np.sqrt(max(variance[k], 1e-300))
-            error[k], common[k] = gain_errors(upper, jones[k], basis, gauge.directions, free, most, weight, prior)
+            error[k], common[k] = gain_errors(factor, jones[k], basis, gauge.directions, free, most, each)
         sigma = np.sqrt(variance)
+        error = error if each else np.full_like(error, np.nan)
         return error * sigma[:, None, None, None], common * sigma[:, None]
 
     def normal(self, left: Float) -> Complex:

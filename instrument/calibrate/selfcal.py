@@ -31,7 +31,9 @@ class SelfCal(Calibrator):
     data then differ from the model by about that much. `min_baseline` leaves out shorter ones. `start` is a term to
     start from (a solution of before, say), the identity otherwise; where that leads nowhere, the leading eigenvectors
     of V M^H are tried, and the better fit is kept. A fit that leaves more than `unexplained` of the rms of the data is
-    reported as `Outcome.POOR_FIT`. Intervals are solved many at a time in compiled code; float64 throughout.
+    reported as `Outcome.POOR_FIT`. Without `errors` those of gains are not worked out, which with beams in the model
+    may take as long as the solve (those of common directions are). Intervals are solved many at a time in compiled
+    code; float64 throughout.
     """
 
     pattern: Literal["full", "diagonal", "scalar", "phase"] = "full"
@@ -42,6 +44,7 @@ class SelfCal(Calibrator):
     min_baseline: Metres | None = None
     unexplained: Annotated[float, Real(above=0, at_most=1)] = 0.5
     start: JonesTerm | None = None
+    errors: bool = True
 
     def solve(self, data: Visibilities, model: Visibilities) -> Solution:
         """Solve every interval. Flagged and non-finite data weigh nothing; raises only when the two do not pair."""

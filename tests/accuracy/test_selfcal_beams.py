@@ -9,6 +9,7 @@ from scipy.linalg import cholesky, expm
 import instrument
 from instrument import Chain, FeedTerm, GainTerm, Observation, Outcome, Scene, SelfCal, mat2
 from instrument.calibrate.errors import gain_errors
+from instrument.calibrate.factor import Factor
 from instrument.calibrate.gauge import GENERATORS
 from instrument.calibrate.lanes import Lanes
 from instrument.calibrate.normal import BASIS, normal_matrix
@@ -168,6 +169,14 @@ def test_without_noise_errors_of_weak_directions_are_not_known(seen):
     assert np.isinf(solution.common_error[..., 0]).all() and np.isnan(solution.common_error[..., 1:]).all()
 
 
+def test_errors_of_gains_can_be_left_out(seen):
+    data = seen.corrupted(errors(0.1)).with_noise(2820 * u.Jy, seed=1)
+    full, bare = (SelfCal(tolerance=1e-8, errors=wanted).solve(data, seen) for wanted in (True, False))
+    assert np.isnan(bare.error).all() and np.isfinite(full.error).all()
+    assert bare.common_error == pytest.approx(full.common_error, rel=0.05)
+    assert np.array_equal(bare.jones, full.jones) and len(bare.gauge.weak) == len(full.gauge.weak) == 3
+
+
 def test_the_errors_are_in_the_file(seen, tmp_path):
     data = seen.corrupted(errors(0.1)).with_noise(282 * u.Jy, seed=1)
     solution = SelfCal(tolerance=1e-8).solve(data, seen)
@@ -218,25 +227,33 @@ def test_the_normal_matrix_is_the_second_derivative(pattern):
                 assert sum(four) / 4e-8 == pytest.approx(found[i, j], abs=1e-6 * np.abs(found).max())
 
 
-def test_errors_are_those_of_the_inverse():
+@pytest.mark.parametrize("now", [3.0, 0.7, 1e-9, 0.0])
+def test_errors_are_those_of_the_inverse(now):
+    """Whatever the weight of the prior was when the factor was made."""
     v, m, a1, a2, jones = laboratory(stations=5)
     normal = np.tril(normal_matrix(v, m, a1, a2, jones, "full"))
     normal = normal + np.tril(normal, -1).T + 1e-3 * np.eye(len(normal))
-    upper, directions = np.asfortranarray(cholesky(normal)), GENERATORS["full"]
+    prior = np.random.default_rng(3).normal(size=(8, len(normal)))
+    factor = Factor(np.asfortranarray(cholesky(normal + 3.0 * prior.T @ prior)), prior, 3.0, jones)
+    factor.now, directions = now, GENERATORS["full"]
     free = np.arange(8) < 3
-    error, common = gain_errors(upper, jones, BASIS["full"], directions, free, 1e9, 0.0, np.zeros((0, 40)))
+    right = np.eye(len(normal))[:, :3]
+    inverse = np.linalg.inv(normal + now * prior.T @ prior)
+    assert factor.exact(now) and factor.solve(right) == pytest.approx(inverse @ right, rel=1e-9, abs=1e-12)
+    error, common = gain_errors(factor, jones, BASIS["full"], directions, free, 1e9)
     turn = np.zeros(normal.shape)
     for k, unit in enumerate(np.eye(len(normal))):
         turn[:, k] = (jones @ unit.view(complex).reshape(jones.shape)).copy().view(float).ravel()
-    covariance = turn @ np.linalg.inv(normal) @ turn.T
+    covariance = turn @ (inverse - now * inverse @ prior.T @ prior @ inverse) @ turn.T
     tangents = np.stack([(jones @ g).copy().view(float).ravel() for g in directions], axis=1)
     q = np.linalg.qr(tangents[:, :3])[0]
     apart = np.eye(len(normal)) - q @ q.T
     wanted = np.diag(apart @ covariance @ apart).reshape(5, 2, 2, 2).mean(axis=-1)
     assert error == pytest.approx(np.sqrt(wanted), rel=1e-9)
-    back = np.linalg.pinv(tangents)
-    assert common[3:] == pytest.approx(np.sqrt(np.diag(back @ covariance @ back.T))[3:], rel=1e-9)
     assert np.all(np.isinf(common[:3]))
+    if now <= 1e-9:  # else without the prior, which is known of its own directions only
+        back = np.linalg.pinv(tangents)
+        assert common[3:] == pytest.approx(np.sqrt(np.diag(back @ covariance @ back.T))[3:], rel=1e-7)
 
 
 def test_exponentials_are_those_of_scipy():
