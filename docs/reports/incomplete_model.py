@@ -1,11 +1,13 @@
 """What calibrating on too few sources does: 1, 5, 50, 400 and 1000 of the 4567 sources of the 3C196 field.
 
     pip install ".[test]" && python docs/reports/incomplete_model.py [--interval 300] [--finer 60]
+    OMP_NUM_THREADS=1 python docs/reports/incomplete_model.py --seeds 20 [--noisy-interval 600]
 
 The whole field is seen through the beams of 59 LOFAR stations for 8 h at 150 MHz, without noise and without gain
 errors; every integration is calibrated on the n brightest sources, seen through the same beams. Integrations are
 `--interval` s apart; 3C196 alone is tried every `--finer` s too. Writes incomplete_model.md and two
-figures beside this file.
+figures beside this file. `--seeds` rewrites the section with noise and gain errors alone, and tries 10 min of
+integrations of 10 s before.
 """
 
 import argparse
@@ -17,6 +19,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
+from astropy import units as u
 
 from instrument.experiments.incomplete_model import IncompleteModel
 from instrument.experiments.incomplete_model_result import ranks
@@ -47,14 +50,14 @@ COLUMNS = {
 }
 
 
-def sweep_of(interval, models):
+def sweep_of(interval, models, duration="8 h", settings=(), **own):
     """The sweep, and the seconds it took."""
-    settings = [f"observation.interval={interval} s", "observation.duration=8 h"]
-    file = parse(override(read_tables("3c196"), settings))
+    times = [f"observation.interval={interval} s", f"observation.duration={duration}"]
+    file = parse(override(read_tables("3c196"), [*times, *settings]))
     plan = file.scene().plan()
     imager = file.stages["image"].imager
     begin = time.perf_counter()
-    found = IncompleteModel(models=models, image=imager).run(plan)
+    found = IncompleteModel(models=models, image=imager, **own).run(plan)
     return found, plan, time.perf_counter() - begin
 
 
@@ -69,6 +72,72 @@ def unmodelled_share():
         for scene in (whole, whole.with_fields(sky=sky.select(np.flatnonzero(ranks(sky) > 0))))
     ]
     return images[1].std() / images[0].std()
+
+
+def short(rms):
+    """Rows: what is left, solves that failed and iterations of 10 min, by noise."""
+    errors = [f"instrument.gain.rms={rms}", f"instrument.feed.rms={rms}"] if rms else []
+    for sefd in (None, 2820, 282):
+        found = sweep_of(10, MODELS, "10 min", errors, sefd=sefd and sefd * u.Jy, watched=60)[0]
+        cells = [f"{100 * a:.3g} %, {b:.1f}, {100 * c:.0f} %" for a, b, c in zip(*told(found), strict=True)]
+        yield f"| {rms or 'none'} | {sefd or 'none'} | {' | '.join(cells)} |"
+
+
+def told(found):
+    return found.visibility_share, found.iterations, found.failed
+
+
+def with_noise(given, rms=0.1, sefd=2820):
+    """The section with noise: means over seeds of noise and errors, and their standard errors."""
+    begin, runs = time.perf_counter(), []
+    as_noisy = sefd * np.sqrt(given.noisy_interval / 10) * u.Jy  # noise of 10 s
+    tried = "\n".join(row for size in (0, rms) for row in short(size))
+    for seed in range(given.seeds):
+        errors = [f"instrument.gain.rms={rms}", f"instrument.feed.rms={rms}", f"seed={seed}"]
+        found, plan, took = sweep_of(given.noisy_interval, MODELS, "8 h", errors, sefd=as_noisy, seed=seed)
+        runs.append(found.table())
+        print(f"seed {seed}: {took:.0f} s, {100 * found.failed} % failed", flush=True)
+    rows = []
+    for name, text in COLUMNS.items():
+        values = np.array([[float(getattr(x, "value", x)) for x in run[name]] for run in runs])
+        mean, error = values.mean(axis=0), values.std(axis=0, ddof=1) / np.sqrt(len(runs))
+        cells = [f"{m:.3g} ± {e:.1g}" if e > 1e-9 * abs(m) else f"{m:.3g}" for m, e in zip(mean, error, strict=True)]
+        unit = getattr(runs[0][name], "unit", None)
+        rows.append(f"| {text}{f', {unit}' if unit else ''} | {' | '.join(cells)} |")
+    return NOISE.format(
+        made=versions(), seeds=given.seeds, interval=given.noisy_interval, count=plan.problem.shape[0], sefd=sefd,
+        rms=rms, seconds=time.perf_counter() - begin, tried=tried, rows="\n".join(rows), head=" |" * len(MODELS),
+        line="---|" * len(MODELS), models=" | ".join(map(str, MODELS)),
+    )  # fmt: skip
+
+
+NOISE = """## With noise and errors
+
+{made}
+Made in {seconds:.0f} s by
+`OMP_NUM_THREADS=1 python docs/reports/incomplete_model.py --seeds {seeds} --noisy-interval {interval}`.
+
+10 min, a solution for each integration of 10 s, without and with errors of gains and feeds that are new in each: rms of
+the residual visibilities (noise of the gains included), iterations in the mean, solves that failed.
+
+| errors | SEFD, Jy | {models} |
+|---|---|{line}
+{tried}
+
+8 h, {count} integrations {interval} s apart with the noise of 10 s at {sefd} Jy, errors of gains and feeds of rms {rms}
+that are new in each: means over {seeds} seeds of noise and errors, and their standard errors. What is measured is the
+change against data with the same noise and the right gains; common directions that are free or weak are taken out.
+
+| |{head}
+|---|{line}
+{rows}
+"""
+
+
+def versions():
+    used = ("numpy", "numba", "ducc0", "instrument")
+    return f"""{date.today()}, {os.cpu_count()} cores ({platform.machine()}), Python {platform.python_version()},
+{", ".join(f"{p} {version(p)}" for p in used)}."""
 
 
 def rms(values):
@@ -86,7 +155,14 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--interval", type=int, default=300)
     parser.add_argument("--finer", type=int, nargs="+", default=[120, 60])
+    parser.add_argument("--seeds", type=int)
+    parser.add_argument("--noisy-interval", type=int, default=600)
     given = parser.parse_args()
+    file = HERE / "incomplete_model.md"
+    whole, _, noisy = file.read_text().partition("\n## With noise") if file.exists() else ("", "", "")
+    if given.seeds:
+        file.write_text(f"{whole}\n{with_noise(given)}")
+        return
     found, plan, seconds = sweep_of(given.interval, MODELS)
     fine = [sweep_of(interval, MODELS[:1]) for interval in given.finer]
     table = found.table()
@@ -106,11 +182,9 @@ def main():
     faint = found.seen & (found.rank > 1000)
     change = found.change_jy[0, faint]
     lost = 2 / 59 * unmodelled_share()
-    used = ("numpy", "numba", "ducc0", "instrument")
     text = f"""# Calibrating on an incomplete model: 1 to 1000 of 4567 sources
 
-{date.today()}, {os.cpu_count()} cores ({platform.machine()}), Python {platform.python_version()},
-{", ".join(f"{p} {version(p)}" for p in used)}.
+{versions()}
 Made by `python docs/reports/incomplete_model.py --interval {given.interval} --finer {" ".join(map(str, given.finer))}`
 in {seconds + sum(f[2] for f in fine):.0f} s, of which the sweep over models took {seconds:.0f} s.
 
@@ -146,9 +220,9 @@ brightest and others down to the faintest, all baselines, against their apparent
 * **More sources in the model means fainter ones**, so the median error of those in the model may rise with n.
 * **Ghosts**: the largest residual farther than a PSF from all sources is {1e3 * found.ghosts[0].jy:.0f} mJy/beam with
   3C196 alone; the brightest source outside that model has {brightest:.1f} Jy apparent.
-* Not tried here: noise (`sefd`), longer solution intervals (`selfcal.interval`), errors of the true gains.
+* Noise and errors of the true gains: below. Not tried here: longer solution intervals (`selfcal.interval`).
 """
-    (HERE / "incomplete_model.md").write_text(text)
+    file.write_text(f"{text}\n## With noise{noisy}" if noisy else text)
     print(text)
 
 

@@ -53,28 +53,36 @@ def everybeam_data():
 
 
 def measured(ways, runs, error, count):
-    """Best (wall s, processor s, processor ms a solution beyond the first), error and converged by way, in turn.
+    """Best wall s, best processor s, that of the first solution; what `error(way, said)` gives; by way, in turn.
 
-    What takes more than 10 s is run once.
+    What takes more than 10 s beyond the first solution is run once.
     """
     found = {}
     for run in range(runs):
         for name, (whole, first) in ways.items():
-            best, value, converged = found.get(name, ((float("inf"),) * 3, None, "?"))
-            if run and best[0] > 10:
+            best, result = found.get(name, ((float("inf"),) * 3, None))
+            if run and best[1] - best[2] > 10:
                 continue
             begun = process(first, QUIET | os.environ)[2]
             wall, _, spent, said = process(whole, QUIET | os.environ)
-            told = re.search(r"[Cc]onverged: *(\d+)", said)
-            best = tuple(map(min, best, (wall, spent, 1e3 * (spent - begun) / (count - 1))))
-            found[name] = best, error(name) if run == 0 else value, told.group(1) if told else converged
+            best = tuple(map(min, best, (wall, spent, begun)))
+            found[name] = best, result or error(name, said)
             print(name, *found[name], flush=True)
-    return found
+    return {
+        name: ((wall, spent, 1e3 * (spent - begun) / (count - 1)), *result)
+        for name, ((wall, spent, begun), result) in found.items()
+    }
 
 
-def row_of(case, name, found, count):
+def told(said, count):
+    """How many integrations converged, as ours and gaincal print it."""
+    found = re.search(r"[Cc]onverged: *(\d+)", said)
+    return f"{found.group(1)} of {count}" if found else "not told"
+
+
+def row_of(case, name, found):
     (wall, spent, one), value, converged = found
-    return f"| {case} | {name} | {value:.1e} | {converged} of {count} | {one:.1f} | {spent:.1f} | {wall:.1f} |"
+    return f"| {case} | {name} | {value:.1e} | {converged} | {one:.1f} | {spent:.1f} | {wall:.1f} |"
 
 
 HEAD = """| case | solver, tolerance | error | converged | ms a solution | processor s | wall s |
