@@ -139,44 +139,40 @@ def figure(shown, rounding):
 
     from instrument.report.style import BLUE, GREY, ORANGE, STYLE
 
-    looks = dict(zip(PROGRAMS, ((BLUE, "o"), (ORANGE, "s"), ("#009E73", "^")), strict=True))
+    looks = dict(zip(PROGRAMS, ((BLUE, "o", -17), (ORANGE, "s", 8), ("#009E73", "^", 8)), strict=True))
     with plt.rc_context(STYLE):
         drawing, panels = plt.subplots(2, 2, figsize=(10, 8), sharex=True, layout="constrained")
         for ax, (case, found) in zip(panels.flat, shown.items(), strict=True):
             quiet, least = "no noise" in case, min(value for _, value, _ in found.values())
-            for which, (colour, mark) in looks.items():
+            for which, (colour, mark, above) in looks.items():
                 points = {name: v for name, v in found.items() if name.startswith(which)}
                 if points:
-                    x = [best[2] for best, _, _ in points.values()]
+                    x = [best[2] if best[2] > 0 else np.nan for best, _, _ in points.values()]  # lost in the start
                     y = [value if quiet else 100 * (value / least - 1) for _, value, _ in points.values()]
                     ax.plot(x, y, color=colour, marker=mark, label=which)
-                    ends(ax, [name.split(", ")[1] for name in points], x, y, colour)
+                    look = {"textcoords": "offset points", "fontsize": 10, "color": colour}
+                    first, *_, last = (name.split(", ")[1] for name in points)  # tolerances
+                    ax.annotate(first, (x[0], y[0]), (-7, -4), ha="right", **look)
+                    ax.annotate(last, (x[-1], y[-1]), (0, above), ha="center", **look)
             if quiet:
                 ax.set_yscale("log")
                 ax.axhspan(rounding / 100, rounding, color=GREY, alpha=0.2, lw=0, label="rounding of complex64")
                 ax.set_ylim(rounding / 4, 2e-3)
             else:
-                ax.set_ylim(-0.1, max(1.0, 1.2 * ax.get_ylim()[1]))
+                ax.set_ylim(-0.08, max(0.3, 1.3 * ax.get_ylim()[1]))
             ax.set_title(case, loc="left")
             ax.grid(alpha=0.3)
         ax.set_xscale("log")
         ax.set_xlim(0.6 * ax.get_xlim()[0], 2 * ax.get_xlim()[1])
-        ax.xaxis.set_major_locator(plt.LogLocator(subs=(1, 2, 5)))
+        ax.xaxis.set_major_locator(plt.LogLocator(subs=(1, 3)))
         ax.xaxis.set_major_formatter("{x:g}")
         ax.xaxis.set_minor_formatter("")
-        panels[0, 0].legend(loc="upper right")
+        drawing.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
         for row in panels:
             row[0].set_ylabel("error (corrected data less model)")
             row[1].set_ylabel("error above the least, %")
         drawing.supxlabel("processor time a solution, ms", fontsize=13)
     return drawing
-
-
-def ends(ax, names, x, y, colour):
-    """The first and the last tolerance of a line, written at their points."""
-    for k, place in ((0, (-6, 7)), (-1, (7, -4))):
-        side = "right" if k == 0 else "left"
-        ax.annotate(names[k], (x[k], y[k]), place, textcoords="offset points", fontsize=10, color=colour, ha=side)
 
 
 def beside_ddecal(given, times=24):
@@ -287,7 +283,7 @@ def main():
         from instrument.report.style import save
 
         rows, ratios, shown, rounding = beside_gaincal(given)
-        save(figure(shown, rounding), HERE / "calibration_beams.png")
+        save(figure(shown, rounding), HERE / "calibration_beams.png", overwrite=True)
         lines = [BESIDE, *ratios, "", HEAD, *rows, "", "![Error against time](calibration_beams.png)"]
         write(TITLES[0], "\n".join(lines), given)
 

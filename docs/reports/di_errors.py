@@ -51,7 +51,7 @@ def main():
         if rms == "1e-3":
             curves["corrected, I"] = found.spectra()["corrected, I"]
         curves[f"corrupted - corrected, I, rms {rms}"] = found.spectra()["corrupted - corrected, I"]
-    save(spectra_2d(curves), HERE / "di_errors.png")
+    save(spectra_2d(curves), HERE / "di_errors.png", overwrite=True)
     newline = "\n"
     text = f"""# DI errors and self-calibration: 25 sources of 5 Jy, errors in every term
 

@@ -173,8 +173,8 @@ def main():
     falling = int((np.diff(power, axis=0) < 0).all(axis=0).sum())
     truth = spectra.pop(0)
     curves = {"true image": truth} | {f"{n} in the model": s for n, s in spectra.items()}
-    save(spectra_2d(curves), HERE / "incomplete_model_spectra.png")
-    save(errors_against_model(found), HERE / "incomplete_model.png")
+    save(spectra_2d(curves), HERE / "incomplete_model_spectra.png", overwrite=True)
+    save(errors_against_model(found), HERE / "incomplete_model.png", overwrite=True)
     shares = [100 * np.sqrt(np.nanmean(spectra[n].power) / np.nanmean(truth.power)) for n in MODELS]
     times, baselines = plan.problem.shape[0], plan.problem.shape[2]
     brightest = float(found.flux_jy[1:][found.seen[1:]].max())

@@ -72,8 +72,8 @@ def figure_of(drawing: Figure | Axes) -> Figure:
     return figure
 
 
-def save(drawing: Figure | Axes, path: str | os.PathLike[str]) -> Path:
+def save(drawing: Figure | Axes, path: str | os.PathLike[str], overwrite: bool = False) -> Path:
     """Write a figure, or the one that axes belong to, as PNG of 150 dots an inch; the file is whole or not there."""
-    with whole_file(path) as partial:
+    with whole_file(path, overwrite) as partial:
         figure_of(drawing).savefig(partial, format="png", dpi=150, bbox_inches="tight", facecolor="white")
     return Path(path)
