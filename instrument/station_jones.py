@@ -50,7 +50,8 @@ def through(vis: Any, jones: Complex, good: Bool | None = None) -> dict[str, Any
     left, right = jones[:, :, a], jones[:, :, b]
     weight, flag = vis.weight, vis.flag
     if correlations.APART not in (weight.ndim, flag.ndim):
-        data = mat2.sandwich(left, vis.data, right)
+        with np.errstate(invalid="ignore"):  # data may hold infinities
+            data = mat2.sandwich(left, vis.data, right)
     else:
         unknown = correlations.alike(vis.data, flag)[1] | ~np.isfinite(vis.data)
         flag = correlations.reached(left, unknown, right)

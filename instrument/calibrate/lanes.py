@@ -159,7 +159,7 @@ class Lanes:
         `each`, those of gains are NaN.
         """
         free = np.arange(len(gauge.seen)) < gauge.count
-        variance = share**2 * self.total / (self.common.freedom + gauge.count)
+        variance = np.where(np.isfinite(share), share, 0.0) ** 2 * self.total / (self.common.freedom + gauge.count)
         basis = BASIS[self.settings.pattern]
         plus, minus, _, gain = self._coupling(jones, np.zeros(self.count))
         size = power_of(jones)
@@ -186,7 +186,8 @@ class Lanes:
             error[k], common[k] = gain_errors(factor, jones[k], basis, gauge.directions, free, most, each)
         sigma = np.sqrt(variance)
         error = error if each else np.full_like(error, np.nan)
-        return error * sigma[:, None, None, None], common * sigma[:, None]
+        with np.errstate(invalid="ignore"):  # infinite errors, where nothing is left over
+            return error * sigma[:, None, None, None], common * sigma[:, None]
 
     def normal(self, left: Float) -> Complex:
         """sum Z Z^H of each station (L, A, 2, 2)."""
@@ -297,7 +298,7 @@ class Memory:
         """The next point (L, A, 2, 2) after a step old -> new; lanes not in `use` take the step and forget the past."""
         lanes = len(old)
         size = np.sqrt(power_of(new))
-        share = np.repeat(1 / np.maximum(size, 1e-9 * size.max(axis=1, keepdims=True) + 1e-300), 8, axis=1)
+        share = np.repeat(1 / np.maximum(size, 1e-9 * size.max(axis=1, keepdims=True) + 1e-140), 8, axis=1)
         x, f = (np.ascontiguousarray(z).view(float).reshape(lanes, -1) for z in (old, new - old))
         self.points, self.steps = [*self.points[-DEPTH:], x], [*self.steps[-DEPTH:], f]
         self.age = np.where(use, self.age + 1, 0)
