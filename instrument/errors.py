@@ -97,7 +97,7 @@ class Outcome(Enum):
     ITERATION_LIMIT = "stopped at the iteration limit: raise the limit, or start nearer to the answer"
     SINGULAR = "the equations do not determine the answer: remove sources that coincide, or add data"
     NON_FINITE = "the input holds NaN or infinity: flag it first"
-    POOR_FIT = "stands still, but most of the data stay unexplained: a wrong model, a wrong start, or noise"
+    POOR_FIT = "most of the data stay unexplained: a wrong model, a wrong start, or noise above the signal"
     REFUSED = "refused: the problem has no answer of this kind"
 
     def check(self) -> None:

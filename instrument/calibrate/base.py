@@ -13,6 +13,7 @@ import numpy as np
 from instrument import mat2
 from instrument.calibrate.fit import doubts
 from instrument.calibrate.gauge import Gauge
+from instrument.calibrate.reasons import FAINT, noisy
 from instrument.checked import checked
 from instrument.component import Component
 from instrument.correlations import APART
@@ -78,10 +79,16 @@ class Solution:
 
     def check(self) -> None:
         """Raise `InstrumentError` when an interval has not converged, with how many ended how."""
+        lost = self.outcome.size - int(self.converged.sum())
+        if lost:
+            raise InstrumentError(
+                f"{lost} of {self.outcome.size} intervals did not converge: {'; '.join(self._ended())}"
+            )
+
+    def _ended(self) -> list[str]:
+        """How intervals ended that did not converge, with how many did."""
         ended = Counter(outcome for outcome in self.outcome.ravel() if outcome is not Outcome.CONVERGED)
-        if ended:
-            ways = "; ".join(f"{count} {outcome.value}" for outcome, count in ended.most_common())
-            raise InstrumentError(f"{sum(ended.values())} of {self.outcome.size} intervals did not converge: {ways}")
+        return [f"{count} {outcome.value}" for outcome, count in ended.most_common()]
 
     def truth(self, term: JonesTerm | Chain, at: Sampling) -> Complex:
         """The matrices (t, f, A, 2, 2) of another term at the centres of the intervals; `at` lends the array."""
@@ -97,13 +104,18 @@ class Solution:
         return self.term.inverse()
 
     def aligned(self, to: Complex) -> Solution:
-        """The same solution, the freedom of its gauge used to come as near as can be to matrices (t, f, A, 2, 2)."""
+        """The same solution, the freedom of its gauge used to come as near as can be to matrices (t, f, A, 2, 2).
+
+        Stations whose gains are noise have no say, unless all are."""
         to = np.asarray(to)
         if to.shape != self.jones.shape:
             raise InputError(f"the matrices to align to have shape {to.shape}, the solution {self.jones.shape}")
-        turn = self.gauge.nearest(self.jones, to)
+        noise = noisy(self.jones, np.broadcast_to(self.error, self.jones.shape), self.gauge.pattern) > FAINT
+        some = noise & ~noise.all(axis=-1, keepdims=True)
+        trusted = np.where(some[..., None, None], np.nan, self.jones)
+        turn = self.gauge.nearest(trusted, to)
         for where, gauge in self.looser.items():
-            turn[where] = gauge.nearest(self.jones[where], to[where])
+            turn[where] = gauge.nearest(trusted[where], to[where])
         turned = mat2.mul(self.jones, turn[:, :, None])
         return replace(self, term=self.term.with_fields(values=turned))
 
@@ -147,6 +159,7 @@ class Solution:
             (
                 f"{good} of {times * channels} intervals converged, {np.median(self.iterations):.0f} iterations "
                 f"(median), residual {left}",
+                *self._ended(),
                 f"{self.gauge}{looser}",
                 *self.doubts,
             )

@@ -12,6 +12,7 @@ from instrument.calibrate.cluster_errors import Errors, errors_of
 from instrument.calibrate.cluster_rounds import Rounds
 from instrument.calibrate.fit import Left, strange
 from instrument.calibrate.graph import counted, tied
+from instrument.calibrate.reasons import ENOUGH
 from instrument.errors import Outcome
 from instrument.units import Bool, Complex, Float
 
@@ -39,7 +40,7 @@ def solved(block: Block, start: Complex) -> Found:
     """The matrices of a block, from a start (K, A, 2, 2)."""
     limits = block.limits
     empty = not block.active.any()
-    if empty or 8 * block.used < block.unknowns:
+    if empty or 8 * block.used < block.unknowns or _loose(block) or _alike(block):
         outcome = Outcome.REFUSED if empty else Outcome.SINGULAR
         return Found(np.full_like(start, np.nan), outcome, np.full(len(block.v), np.nan))
     live = block.active.T[:, None, :, None]
@@ -48,9 +49,9 @@ def solved(block: Block, start: Complex) -> Found:
     left, history = rounds.left, np.array(rounds.history)
     # interference that the weights have put aside is no misfit
     rest = block.share(left, block.weights(left))
-    if not np.isfinite(history[-1]) or _singular(block, rounds.x) or _loose(block):
+    if not np.isfinite(history[-1]) or _coincident(block, rounds.x):
         outcome = Outcome.SINGULAR
-    elif not rounds.still:
+    elif not rounds.still and (np.nanmax(rest) <= limits.unexplained or len(history) < ENOUGH):
         outcome = Outcome.ITERATION_LIMIT
     elif not np.nanmax(rest) <= limits.unexplained or _odd(block, left):
         outcome = Outcome.POOR_FIT
@@ -107,9 +108,14 @@ def _loose(block: Block) -> bool:
     return False
 
 
-def _singular(block: Block, x: Complex) -> bool:
-    """Whether clusters are alike: as models to the array (then their matrices mix), or corrupted to a station."""
+def _alike(block: Block) -> bool:
+    """Whether the models of clusters are alike to the whole array: noise then mixes their matrices."""
     plain: Complex = np.eye(2)[None, :, None, :] * block.active.T[:, None, :, None] + 0j
-    whole, each = (Equations(block, y, block.seen(y)[0], block.w).normal for y in (plain, x))
-    alike = np.linalg.eigvalsh(unit_diagonal(whole.sum(axis=0))[0]).min() < ALIKE
-    return bool(alike or np.linalg.eigvalsh(unit_diagonal(each)[0]).min() < COINCIDENT)
+    whole = Equations(block, plain, block.seen(plain)[0], block.w).normal.sum(axis=0)
+    return bool(np.linalg.eigvalsh(unit_diagonal(whole)[0]).min() < ALIKE)
+
+
+def _coincident(block: Block, x: Complex) -> bool:
+    """Whether clusters, corrupted, are alike to a station."""
+    each = Equations(block, x, block.seen(x)[0], block.w).normal
+    return bool(np.linalg.eigvalsh(unit_diagonal(each)[0]).min() < COINCIDENT)

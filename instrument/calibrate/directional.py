@@ -89,7 +89,7 @@ class DirectionalCal(Calibrator):
             raise InputError(f"channels = {self.channels} of one solution, but the data have {data.data.shape[1]}")
         cells = [(int(k), f) for k in grid.blocks for f in range(0, data.data.shape[1], self.channels)]
         scale = [near_one(x) for x in (data.data[..., None], stacked[..., None], weight)]
-        job = Job(self, data, stacked, weight, grid, scale)
+        job = Job(self, data, stacked, weight, grid, scale, names)
         look_again()
         with ONE_THREAD, ThreadPoolExecutor(os.cpu_count() or 1) as pool:
             parts = list(pool.map(lambda cell: job.solve(*cell), cells))

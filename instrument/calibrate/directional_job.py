@@ -14,12 +14,13 @@ from instrument.calibrate.chunk import SolveSettings
 from instrument.calibrate.cluster_data import Block, Limits
 from instrument.calibrate.clusters import Found, solved, suspects
 from instrument.calibrate.gauge import GENERATORS, Gauge, gauge_of
+from instrument.calibrate.reasons import ENOUGH, Asked, faint, noisy, told, unknown
 from instrument.errors import InputError, Outcome
 from instrument.jones.table import JonesTable
 from instrument.units import Bool, Complex, Float, Int
 from instrument.visibilities import Visibilities
 
-FAINT = 0.3  # standard error per element beyond which matrices of a cluster are noise
+EMPTY = "its model is zero wherever data count"
 
 
 class BlockSettings(SolveSettings, Protocol):
@@ -81,6 +82,7 @@ class Part:
     column: Int  # (P, C): the unknown that a cluster has in a piece
     pieces: Int  # (P, C): the interval of the cluster that it belongs to
     suspects: list[tuple[Int, slice, Bool]]  # times, channels and which visibilities of them stand out
+    why: str = ""  # there is no solution
 
 
 @dataclass
@@ -93,6 +95,7 @@ class Job:
     weight: Float
     grid: Grid
     scale: list[float]  # of data, models and weights: what 1e170 Jy are divided by, since its square is infinite
+    names: list[str]  # of the clusters
 
     def solve(self, block: int, channel: int) -> Part:
         """Solve one block of integrations, and `channels` channels from `channel` on."""
@@ -129,9 +132,22 @@ class Job:
             shape = (-1, span.stop - span.start, weight.shape[2])
             for t, mask in zip(chosen, suspects(stretch, begin), strict=True):
                 aside.append((t, span, mask.reshape(shape)[: len(t)]))
+        why = ""
+        enough = found.outcome is Outcome.ITERATION_LIMIT and len(found.history) >= ENOUGH
+        if (enough or found.outcome in (Outcome.REFUSED, Outcome.SINGULAR)) and finite:
+            why = self._why(stretch)
+            if enough and why:
+                found.outcome = Outcome.SINGULAR
         alive = [Outcome.REFUSED if finite else Outcome.NON_FINITE, found.outcome]
         outcomes = [alive[int(row.any())] for row in stretch.active]
-        return Part((block, channel), found.times(root), outcomes, column, first, aside)
+        return Part((block, channel), found.times(root), outcomes, column, first, aside, why)
+
+    def _why(self, block: Block) -> str:
+        """What the data and models of a block do not tell."""
+        asked = Asked(block.a1, block.a2, self.data.layout.names, block.limits.pattern, self.names)
+        flat = block.weight.reshape(-1, len(block.a1))
+        data, models = block.data.reshape(*flat.shape, 2, 2), block.models.reshape(-1, *flat.shape, 2, 2)
+        return asked.reason(data, models, flat, ~block.active.any(axis=0))
 
     def _start(self, row: Int, span: slice, columns: int) -> Complex:
         begin = np.zeros((columns, len(self.data.layout), 2, 2), complex)
@@ -155,6 +171,7 @@ class Job:
         count = np.zeros(shape, int)
         share = np.full(shape, np.nan)
         loose: dict[tuple[int, int], Complex] = {}
+        reasons: list[str] = []
         for part in parts:
             f, found = part.cell[1] // settings.channels, part.found
             for own in np.unique(part.pieces[:, cluster]):
@@ -164,13 +181,12 @@ class Job:
                 count[t, f], share[t, f] = len(found.history), np.sqrt(np.mean(found.share[here] ** 2))
                 outcome[t, f] = part.outcome[k]
                 if part.outcome[k] is not Outcome.CONVERGED:
+                    reasons.append(part.why or EMPTY * (part.outcome[k] is Outcome.REFUSED))
                     continue
                 jones[t, f] = found.jones[k]
                 if found.errors is not None:
                     error[t, f], common[t, f] = found.errors.gains[k], found.errors.common[k]
                     loose[t, f] = found.errors.loose[k]
-        longest = max(len(p.found.history) for p in parts)
-        history = [np.pad(p.found.history, (0, longest - len(p.found.history))) for p in parts]
         gauge, looser = weak_gauges(gauge_of(self.models[cluster], self.weight, settings.pattern), loose)
         return Solution(
             term=JonesTable(
@@ -184,15 +200,20 @@ class Job:
             residual=share,
             gauge=gauge,
             looser=looser,
-            history=np.stack(history).max(axis=0),
+            history=_longest([p.found.history for p in parts]),
             interval_s=self.grid.steps[cluster] * data.integration_s,
             suspects=suspects,
             spoilt=by_baseline(suspects, data),
             unexplained=share,
             error=error,
             common_error=common,
-            notes=(*_faint(error, outcome == Outcome.CONVERGED, settings.pattern), *partly_known(data)),
+            notes=(*told(reasons), *self._doubts(error, outcome), *partly_known(data)),
         )
+
+    def _doubts(self, error: Float, outcome: Any) -> tuple[str, ...]:
+        """Sentences on matrices near 1 that are noise, or of unknown errors."""
+        converged, noise = outcome == Outcome.CONVERGED, noisy(np.eye(2) + 0j, error, self.settings.pattern)
+        return (*unknown(error, converged), *faint(noise, converged, self.data.layout.names, "the cluster"))
 
 
 def weak_gauges(gauge: Gauge, loose: dict[tuple[int, int], Complex]) -> tuple[Gauge, dict[tuple[int, int], Gauge]]:
@@ -213,22 +234,10 @@ def weak_gauges(gauge: Gauge, loose: dict[tuple[int, int], Complex]) -> tuple[Ga
     return weak.pop(first), weak
 
 
-def _faint(error: Float, converged: Bool, pattern: str) -> tuple[str, ...]:
-    """A sentence where the matrices of a cluster are noise, or their errors unknown."""
-    known = np.isfinite(error).all(axis=(-2, -1)) & converged[..., None]
-    if converged.any() and not known.any():
-        return ("errors of gains are not known: an interval has too many unknowns",)
-    share = 1.0 if pattern == "full" else 0.5  # of the elements are unknown
-    with np.errstate(invalid="ignore"):
-        rms = np.sqrt(np.where(known, np.mean(error**2, axis=(-2, -1)) / share, 0).sum(-1) / known.sum(-1))
-    faint = rms > FAINT
-    if not faint.any():
-        return ()
-    return (
-        f"{faint.sum()} of {converged.sum()} solutions have a standard error of {np.median(rms[faint]):.2g} per "
-        "element: the cluster is too faint for these intervals (make them longer, or join it to another cluster), or "
-        "its polarization leaves elements open",
-    )
+def _longest(steps: list[Float]) -> Float:
+    """Largest step after each round, of those of all blocks."""
+    longest = max(len(x) for x in steps)
+    return np.asarray(np.stack([np.pad(x, (0, longest - len(x))) for x in steps]).max(axis=0))
 
 
 def even(pieces: list[Any]) -> Any:

@@ -91,17 +91,31 @@ class Gauge:
             return np.asarray(u @ vh)
         from scipy.linalg import expm
 
-        for _ in range(50):  # Gauss-Newton on the few parameters, from the left over of T - J X
+        many, damping, rest = len(generators), np.zeros(x.shape[:-2]), _apart(a, x, b)
+        for _ in range(100):  # Levenberg and Marquardt on the few parameters, from the left over of T - J X
             turned = a @ x[..., None, :, :]
             moves = np.einsum("...aij,njk->...naik", turned, generators)
             left = (b - turned)[..., None, :, :, :]
             gradient = np.einsum("...naij,...naij->...n", moves.conj(), np.broadcast_to(left, moves.shape)).real
             gram = np.einsum("...naij,...maij->...nm", moves.conj(), moves).real
-            y = np.linalg.solve(gram + 1e-14 * np.eye(len(generators)), gradient[..., None])[..., 0]
-            x = x @ expm(np.einsum("...n,nij->...ij", y, generators))
-            if np.abs(y).max() < 1e-13:
+            size = np.maximum(np.einsum("...nn->...", gram) / many, 1e-300)
+            ridge = ((1e-14 + damping) * size)[..., None, None] * np.eye(many)
+            y = np.linalg.solve(gram + ridge, gradient[..., None])[..., 0]
+            length = np.linalg.norm(y, axis=-1)
+            y = y / np.maximum(length, 1.0)[..., None]  # where matrices are noise, whole steps run away
+            tried = x @ expm(np.einsum("...n,nij->...ij", y, generators))
+            new = _apart(a, tried, b)
+            good = (new <= rest) | (length < 1e-6)
+            x, rest = np.where(good[..., None, None], tried, x), np.where(good, new, rest)
+            damping = np.where(good, np.where(damping > 1e-6, damping / 10, 0.0), np.maximum(10 * damping, 1e-3))
+            if np.max(length) < 1e-13:
                 break
         return x
+
+
+def _apart(jones: Complex, x: Complex, to: Complex) -> Float:
+    """Power (...) of T - J X, of matrices (..., A, 2, 2) and X (..., 2, 2)."""
+    return np.asarray((np.abs(to - jones @ x[..., None, :, :]) ** 2).sum(axis=(-3, -2, -1)))
 
 
 def second_moment(model: Complex, weight: Float | None = None) -> Complex:

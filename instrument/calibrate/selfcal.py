@@ -9,11 +9,12 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from instrument.calibrate.base import Calibrator, Solution, by_baseline, other_length, pair, partly_known
-from instrument.calibrate.chunk import Cell, Job
+from instrument.calibrate.chunk import Cell, Job, Part
 from instrument.calibrate.gauge import gauge_of
 from instrument.calibrate.newton import lanes_of
+from instrument.calibrate.reasons import ENOUGH, Asked, faint, noisy, told
 from instrument.checked import checked
-from instrument.errors import InputError
+from instrument.errors import InputError, Outcome
 from instrument.jones.base import JonesTerm
 from instrument.jones.table import JonesTable
 from instrument.observe.intervals import intervals
@@ -64,8 +65,11 @@ class SelfCal(Calibrator):
         freqs = np.array([data.at.freq_hz[f].mean() for f in channels])
         outcome = np.empty(len(cells), object)
         outcome[:] = [o for p in parts for o in p.outcome]
+        why = self._why(outcome, cells, data, (v, m, weight), parts)
         longest = max(len(p.history) for p in parts)
         history = np.stack([np.pad(p.history, (0, longest - len(p.history))) for p in parts]).max(axis=0)
+        error = np.concatenate([p.error for p in parts]).reshape(jones.shape)
+        noise = noisy(jones, error, self.pattern)
         common_error = np.concatenate([p.common_error for p in parts]).reshape(*shape, -1)
         suspects = _mask({i * size + k: x for i, p in enumerate(parts) for k, x in p.suspects.items()}, cells, data)
         return Solution(
@@ -80,10 +84,36 @@ class SelfCal(Calibrator):
             suspects=suspects,
             spoilt=by_baseline(suspects, data),
             unexplained=np.concatenate([p.worst for p in parts]).reshape(shape),
-            notes=(*other_length(grouped, self.interval), *partly_known(data)),
-            error=np.concatenate([p.error for p in parts]).reshape(jones.shape),
+            notes=(
+                *why,
+                *faint(noise, outcome == Outcome.CONVERGED, data.layout.names, "the model"),
+                *other_length(grouped, self.interval),
+                *partly_known(data),
+            ),
+            error=error,
             common_error=common_error,
         )
+
+    def _why(
+        self, outcome: Any, cells: list[Cell], data: Visibilities, given: tuple[Any, ...],
+        parts: list[Part],
+    ) -> tuple[str, ...]:  # fmt: skip
+        """Sentences on intervals without a solution; the limit of iterations is no reason where there is another."""
+        asked = Asked(data.antenna1, data.antenna2, data.layout.names, self.pattern)
+        share, count = (np.concatenate([getattr(p, name) for p in parts]) for name in ("residual", "iterations"))
+        reasons = []
+        for k, ended in enumerate(outcome):
+            if ended not in (Outcome.REFUSED, Outcome.SINGULAR, Outcome.ITERATION_LIMIT):
+                continue
+            if ended is Outcome.ITERATION_LIMIT and count[k] < ENOUGH:
+                continue
+            v, m, weight = (x[cells[k]].reshape(-1, *x.shape[2:]) for x in given)
+            reasons.append(asked.reason(v, m[None], weight))
+            if ended is Outcome.ITERATION_LIMIT and reasons[-1]:
+                outcome[k] = Outcome.SINGULAR
+            elif ended is Outcome.ITERATION_LIMIT and share[k] > self.unexplained:
+                outcome[k] = Outcome.POOR_FIT
+        return told(reasons)
 
     def _cut(self, data: Visibilities, weight: Float) -> Float:
         if self.min_baseline is None:

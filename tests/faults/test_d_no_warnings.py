@@ -89,7 +89,7 @@ def spoilt(kind, beams):
 def used(found, data, folder):
     """Prints a solution, writes it, draws it, takes it out of the data."""
     str(found), repr(found)
-    write_h5parm(folder / "gains.h5", found, at=data.at)
+    write_h5parm(folder / "gains.h5", found, at=data.at, overwrite=True)
     for solution in getattr(found, "clusters", {"all": found}).values():
         data.corrected(solution.term)
         for draw in (gains, gain_errors, bandpass, outcomes, convergence, residuals, common_errors):
