@@ -1,0 +1,83 @@
+"""Stiff and extreme calibrations through beams: right, or an outcome with words that say why not."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy import units as u
+
+from instrument import Outcome
+from instrument.calibrate.gauge import GENERATORS, Gauge
+
+spec = importlib.util.spec_from_file_location("stiff", Path(__file__).with_name("stiff_beams.py"))
+stiff = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(stiff)
+SOLVERS = ("self", "towards")
+FAST = {"ordinary", "two stations", "one source", "all in one place", "a cluster without flux", "islands",
+        "between two groups", "start at -1", "start at i"}  # fmt: skip
+ALSO = {("self", "null of one receptor"), ("towards", "all polarized"), ("self", "start at 1e6")}
+CASES = [
+    pytest.param(solver, kind, noisy, marks=[] if kind in FAST or (solver, kind) in ALSO else [pytest.mark.long])
+    for solver in SOLVERS
+    for kind in stiff.KINDS
+    for noisy in (False, True)
+]
+
+
+@pytest.mark.parametrize(("solver", "kind", "noisy"), CASES)
+def test_stiff_and_extreme(solver, kind, noisy):
+    found = stiff.judged(stiff.case(kind, solver, noisy))
+    right, words = stiff.ends(kind, solver, noisy)
+    assert words in found.said
+    if not right:
+        assert found.outcome in ("SINGULAR", "POOR_FIT", "InputError")
+    elif noisy:
+        assert found.outcome == "CONVERGED" and abs(found.off - 1) < 0.4
+    else:
+        assert found.outcome == "CONVERGED" and found.off < 10 * stiff.TOLERANCE
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("kind", stiff.KINDS)
+def test_with_noise_the_errors_are_those_of_noise(solver, kind):
+    """Over 40 draws: off within 4 of its own standard errors of Cramer and Rao, pulls of gains near 1."""
+    if not stiff.ends(kind, solver, True)[0]:
+        pytest.skip("has no solution, as test_stiff_and_extreme says")
+    found = [stiff.judged(stiff.case(kind, solver, True, seed)) for seed in range(40)]
+    good = [v for v in found if v.outcome == "CONVERGED"]
+    assert len(good) >= 20 and all(v.outcome in ("CONVERGED", "SINGULAR", "ITERATION_LIMIT") for v in found)
+    squares = np.concatenate([v.squares for v in good])
+    assert np.sqrt(np.mean([v.off**2 for v in good])) == pytest.approx(1, abs=0.06)
+    assert np.sqrt(np.mean(squares)) == pytest.approx(1, abs=0.1)
+
+
+def test_matrices_that_are_noise_are_aligned_without_running_away():
+    """Gains of some stations 30 times too large and random, directions free that are not unitary."""
+    rng = np.random.default_rng(1)
+    truth = np.eye(2) + 0.1 * rng.normal(size=(20, 12, 2, 4)).view(complex)
+    found = truth.copy()
+    found[:, :4] = 30 * rng.normal(size=(20, 4, 2, 4)).view(complex)
+    gauge = Gauge(GENERATORS["full"], np.zeros(8), "full")
+    x = gauge.nearest(found, truth)
+    left = (np.abs(truth - found @ x[:, None]) ** 2).sum(axis=(1, 2, 3))
+    assert np.all(left <= (np.abs(truth - found) ** 2).sum(axis=(1, 2, 3)))
+    # the best matrix of all, which exponentials of these generators reach, by least squares
+    best = np.linalg.pinv(found.reshape(20, 24, 2)) @ truth.reshape(20, 24, 2)
+    assert left == pytest.approx((np.abs(truth - found @ best[:, None]) ** 2).sum(axis=(1, 2, 3)), rel=1e-6)
+
+
+def test_few_iterations_are_said_to_be_few():
+    """A limit of iterations below what a solve takes is no singular problem, and no poor fit."""
+    for solver in SOLVERS:
+        found = stiff.judged(stiff.case("ordinary", solver, True, iterations=2))
+        assert found.outcome == "ITERATION_LIMIT" and "raise the limit" in found.said
+
+
+def test_a_cluster_that_is_seen_in_some_intervals_only():
+    one = stiff.case("ordinary", "towards", True)
+    gone = one.sky["c"].with_data(np.where(np.arange(6)[:, None, None, None, None] < 2, 0.0, one.sky["c"].data))
+    found = one.solver.with_fields(interval=20 * u.s).solve(one.data, {**one.sky, "c": gone})["c"]
+    assert found.outcome.ravel().tolist() == [Outcome.REFUSED, Outcome.CONVERGED, Outcome.CONVERGED]
+    assert "no solution of 1 interval: its model is zero wherever data count" in str(found)
