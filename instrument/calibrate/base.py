@@ -13,7 +13,6 @@ import numpy as np
 from instrument import mat2
 from instrument.calibrate.fit import doubts
 from instrument.calibrate.gauge import Gauge
-from instrument.calibrate.reasons import FAINT, noisy
 from instrument.checked import checked
 from instrument.component import Component
 from instrument.correlations import APART
@@ -104,18 +103,13 @@ class Solution:
         return self.term.inverse()
 
     def aligned(self, to: Complex) -> Solution:
-        """The same solution, the freedom of its gauge used to come as near as can be to matrices (t, f, A, 2, 2).
-
-        Stations whose gains are noise have no say, unless all are."""
+        """The same solution, the freedom of its gauge used to come as near as can be to matrices (t, f, A, 2, 2)."""
         to = np.asarray(to)
         if to.shape != self.jones.shape:
             raise InputError(f"the matrices to align to have shape {to.shape}, the solution {self.jones.shape}")
-        noise = noisy(self.jones, np.broadcast_to(self.error, self.jones.shape), self.gauge.pattern) > FAINT
-        some = noise & ~noise.all(axis=-1, keepdims=True)
-        trusted = np.where(some[..., None, None], np.nan, self.jones)
-        turn = self.gauge.nearest(trusted, to)
+        turn = self.gauge.nearest(self.jones, to)
         for where, gauge in self.looser.items():
-            turn[where] = gauge.nearest(trusted[where], to[where])
+            turn[where] = gauge.nearest(self.jones[where], to[where])
         turned = mat2.mul(self.jones, turn[:, :, None])
         return replace(self, term=self.term.with_fields(values=turned))
 

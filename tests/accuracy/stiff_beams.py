@@ -173,7 +173,7 @@ def _pulls(solution, truth):
         solution.error[0, 0] < FAINT * np.sqrt(np.mean(np.abs(solution.jones[0, 0]) ** 2, axis=(-2, -1)))[:, None, None]
     )
     left = solution.aligned(truth[None, None]).jones[0, 0] - truth
-    return (np.abs(left / solution.error[0, 0]) ** 2 / 2)[near]
+    return np.abs(left[near] / solution.error[0, 0][near]) ** 2 / 2
 
 
 # How they end: whether right, and words of what is printed, of SelfCal without noise, with noise, of DirectionalCal
@@ -186,7 +186,7 @@ ENDS = {
     "1 integration of 5 stations": [RIGHT] * 2 + [(False, "80 numbers do not give 120 unknowns")] * 2,
     "all polarized alike": [RIGHT] * 2 + [(False, "differ by 0.23 % of themselves")] * 2,
     "all polarized": [RIGHT] * 2 + [(False, ONE)] * 2,
-    "circularly polarized": [RIGHT] * 2 + [(False, ONE)] * 2,
+    "circularly polarized": [RIGHT, (True, "are noise")] + [(False, ONE)] * 2,
     "all in one place": [RIGHT] * 2 + [(False, "'b' and 'a' differ by")] * 2,
     "1 arcsec apart": [RIGHT] * 2 + [(False, "'a' and 'b' differ by 34 % of themselves")] * 2,
     "a cluster without flux": [RIGHT] * 2 + [(False, "'c' is zero everywhere: leave it out")] * 2,
@@ -195,8 +195,8 @@ ENDS = {
     "SNR 0.01": [RIGHT, (False, "noise above the signal")] * 2,
     "null of both receptors": [RIGHT, (False, "noise above the signal")] * 2,
     "null of one receptor": [(False, ONE)] * 4,
-    "null of some stations": [RIGHT, (True, "is hardly seen there")] * 2,
-    "null of one receptor of some stations": [(False, ONE), (True, "is hardly seen there"), (False, ONE), (False, ONE)],
+    "null of some stations": [RIGHT, (True, "are noise")] * 2,
+    "null of one receptor of some stations": [RIGHT, (True, "are noise"), (False, ONE), (False, ONE)],
 }
 
 

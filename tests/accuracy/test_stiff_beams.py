@@ -42,15 +42,33 @@ def test_stiff_and_extreme(solver, kind, noisy):
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("kind", stiff.KINDS)
 def test_with_noise_the_errors_are_those_of_noise(solver, kind):
-    """Over 40 draws: off within 4 of its own standard errors of Cramer and Rao, pulls of gains near 1."""
-    if not stiff.ends(kind, solver, True)[0]:
+    """Over 20 draws: off as Cramer and Rao allow; pulls of gains are 1, unless gains are said to be noise."""
+    right, words = stiff.ends(kind, solver, True)
+    if not right:
         pytest.skip("has no solution, as test_stiff_and_extreme says")
-    found = [stiff.judged(stiff.case(kind, solver, True, seed)) for seed in range(40)]
+    found = [stiff.judged(stiff.case(kind, solver, True, seed)) for seed in range(20)]
     good = [v for v in found if v.outcome == "CONVERGED"]
-    assert len(good) >= 20 and all(v.outcome in ("CONVERGED", "SINGULAR", "ITERATION_LIMIT") for v in found)
-    squares = np.concatenate([v.squares for v in good])
-    assert np.sqrt(np.mean([v.off**2 for v in good])) == pytest.approx(1, abs=0.06)
-    assert np.sqrt(np.mean(squares)) == pytest.approx(1, abs=0.1)
+    assert len(good) >= (10 if words else 19)
+    assert all(v.outcome in ("CONVERGED", "SINGULAR", "ITERATION_LIMIT") and words in v.said for v in good)
+    off = np.sqrt(np.mean([v.off**2 for v in good]))
+    # 96 unknowns of 20 draws scatter by 2 %; where gains are noise the fit is no longer linear in them
+    assert off == pytest.approx(1, abs=0.12 if words else 0.06)
+    if not words:
+        assert np.sqrt(np.mean(np.concatenate([v.squares for v in good]))) == pytest.approx(1, abs=0.1)
+
+
+@pytest.mark.long
+def test_what_is_said_of_stations_helps():
+    """Gains of stations in the null of a beam are noise: flagged as is said, errors are those of noise."""
+    squares = []
+    for seed in range(20):
+        one = stiff.case("null of some stations", "self", True, seed)
+        there = (one.data.antenna1 < 4) | (one.data.antenna2 < 4)
+        one.data = one.data.flagged(there[None, None])
+        found = stiff.judged(one)
+        assert "are noise" not in found.said
+        squares.append(found.squares)
+    assert np.sqrt(np.mean(np.concatenate(squares))) == pytest.approx(1, abs=0.1)
 
 
 def test_matrices_that_are_noise_are_aligned_without_running_away():
