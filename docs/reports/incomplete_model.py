@@ -111,7 +111,7 @@ def averaged(runs):
     for name, text in COLUMNS.items():
         values = np.array([[float(getattr(x, "value", x)) for x in run[name]] for run in runs])
         mean, error = values.mean(axis=0), values.std(axis=0, ddof=1) / np.sqrt(len(runs))
-        cells = [f"{m:.3g} ± {e:.1g}" if e > 1e-9 * abs(m) else f"{m:.3g}" for m, e in zip(mean, error, strict=True)]
+        cells = [f"{m:.3g} ± {e:.1g}" if e > 1e-9 * abs(m) else f"{m:.4g}" for m, e in zip(mean, error, strict=True)]
         unit = getattr(runs[0][name], "unit", None)
         yield f"| {text}{f', {unit}' if unit else ''} | {' | '.join(cells)} |"
 
