@@ -137,10 +137,10 @@ change against data with the same noise and the right gains; common directions t
 |---|{line}
 {rows}
 
-From 5 sources on the residual visibilities scatter more from seed to seed than with 3C196 alone: it is in pq and qp, in
-integrations in which a direction common to all stations has a standard error of 0.15 to 0.3 (seed 0, 1000 sources:
-3.6 % of the rms in pq and qp in the worst integration, 0.6 % in the best, 0.6 to 1.3 % in pp and qq). Only above 0.3 does it count as weak, is held near the start, and is taken out of the
-comparison. Images of Stokes I hardly see it.
+From 5 sources on the residual visibilities scatter more from seed to seed than with 3C196 alone: it is in pq and qp,
+in integrations in which a direction common to all stations has a standard error of 0.15 to 0.3 (seed 0, 1000 sources:
+3.6 % of the rms in pq and qp in the worst integration, 0.6 % in the best, 0.6 to 1.3 % in pp and qq). Only above 0.3
+does it count as weak, is held near the start, and is taken out of the comparison. Images of Stokes I hardly see it.
 """
 
 

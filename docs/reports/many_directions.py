@@ -180,9 +180,9 @@ for all is. Matrices: rms error per element of the clusters, common directions t
 {table}
 
 All 59 stations for 10 min, matrices that turn over once in an hour, 2820 Jy (2026-11-26,
-`instrument run many-directions --set instrument.beam=full --set "observation.duration=10 min"`, 72 s on a busy machine, 42 s of processor time): all 10
-intervals of the five clusters converge, 0.999 of the noise is left (0.999 is due), 0.238 is wrong (one direction for
-all: 0.696).
+`instrument run many-directions --set instrument.beam=full --set "observation.duration=10 min"`, 72 s on a busy
+machine, 42 s of processor time): all 10 intervals of the five clusters converge, 0.999 of the noise is left (0.999 is
+due), 0.238 is wrong (one direction for all: 0.696).
 """
 
 
