@@ -60,6 +60,12 @@ def parser() -> argparse.ArgumentParser:
     both.add_argument("first", metavar="RUN", help="a run folder")
     both.add_argument("second", metavar="RUN", help="another, held against the first")
     _add_out(both, "folder to write a page compare.html into, new or empty (default: none is written)")
+    text = "Error against run time of a scene, a kind of plugin, or a plugin beside the others of its kind."
+    verb = verbs.add_parser("precision", help=text, description=text)
+    verb.add_argument("what", metavar="WHAT", help="a scene, a kind of plugin (engines, ...), or a plugin")
+    verb.add_argument("--plugins", metavar="A,B", help="of these plugins alone (default: all that can be had)")
+    verb.add_argument("--quick", action="store_true", help="one value a decade, three repeats")
+    _add_out(verb, "folder to write, new or empty (default: runs/precision-WHAT, or the next free name)")
     verbs.add_parser("scenes", help="List the shipped scenes.")
     plugins = verbs.add_parser("plugins", help="List the plugins, and what is broken; with a NAME its settings.")
     plugins.add_argument("name", metavar="NAME", nargs="?", help="a plugin: its settings, their units and defaults")
@@ -234,6 +240,17 @@ def _compare(given: argparse.Namespace) -> int:
     return DONE
 
 
+def _precision(given: argparse.Namespace) -> int:
+    import shlex
+
+    from instrument.precision.command import precision
+
+    plugins = [name.strip() for name in given.plugins.split(",")] if given.plugins else []
+    command = shlex.join(["instrument", *given.words])
+    kept = precision(given.what, plugins, given.quick, given.out, show, given.force, command)
+    return DONE if kept else FELL_SHORT
+
+
 def _scenes(given: argparse.Namespace) -> int:
     from instrument.pipeline.scene_text import shipped
 
@@ -273,6 +290,7 @@ VERBS = {
     "plan": _plan,
     "analyze": _analyze,
     "compare": _compare,
+    "precision": _precision,
     "scenes": _scenes,
     "plugins": _plugins,
     "doctor": _doctor,

@@ -4,7 +4,8 @@
 
 Telescopes (LOFAR of both bands, dishes, dipoles, phased stations, none), chains of up to nine terms, skies with P > I
 and rotation measures to 1e5 rad/m2, 10 MHz to 10 GHz, baselines of 1 m to 1e7 m, tolerances of 0 to 0.1. The truth is
-`longdouble.py`, which takes the rotation of the Earth from the package and works out the rest on its own. Writes
+`instrument.precision.truth`, which takes the rotation of the Earth from the package and works out the rest on its own.
+Writes
 bounds.md beside this file.
 """
 
@@ -17,10 +18,10 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-from longdouble import visibilities
 from random_scenes import scene
 
 from instrument import InputError, InstrumentWarning
+from instrument.precision.truth import visibilities
 
 HERE = Path(__file__).parent
 

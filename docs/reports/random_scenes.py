@@ -6,7 +6,6 @@ from astropy.coordinates import SkyCoord
 from instrument_plugins.elements.dipole import CrossedDipole
 from instrument_plugins.elements.dish import Airy, Gaussian
 from instrument_plugins.elements.hamaker import Hamaker
-from longdouble import LIGHT, I, matrix, real
 
 import instrument
 from instrument import (
@@ -25,6 +24,7 @@ from instrument import (
     StationBeam,
     mat2,
 )
+from instrument.precision.truth import LIGHT, I, matrix, real
 
 TOLERANCES = (0, 0, 1e-12, 1e-10, 1e-8, 1e-6, 1e-4, 1e-3, 1e-2, 1e-1)
 BANDS = {"lofar-hba": (120e6, 240e6), "lofar-lba": (10e6, 100e6)}

@@ -16,7 +16,7 @@ from instrument.errors import InputError, warn
 
 MOST_BYTES = 200e6  # of a record
 PARTIAL = ".instrument-partial"  # ends the names of folders that are being written
-OURS = ("run.json", "compare.json")  # files that only a folder written here holds
+OURS = ("run.json", "compare.json", "precision.ecsv")  # files that only a folder written here holds
 TAKEN = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)  # what moving a folder onto something else answers
 
 

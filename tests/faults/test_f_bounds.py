@@ -30,6 +30,7 @@ from instrument import (
 )
 from instrument.jones.base import Simplified
 from instrument.observe.directions import offset
+from instrument.precision.truth import visibilities
 from instrument.predict.base import Blockwise, Predictor
 from instrument.predict.direct import Direct
 from instrument.predict.rounding import total_flux
@@ -64,7 +65,7 @@ def scene(sky, terms=(), centre=CENTRE, frequencies=(150,), stations=None, count
 
 
 def error_of(plan, reports):
-    truth = reports("longdouble").visibilities(plan.full)
+    truth = visibilities(plan.full)
     return float(np.abs(plan.run().data - truth).max() / np.longdouble(plan.scale_jy))
 
 

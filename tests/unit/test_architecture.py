@@ -54,6 +54,7 @@ LAYERS = (
     ("report",),
     ("pipeline",),
     ("conformance",),
+    ("precision",),
     ("doctor",),
     ("",),  # `instrument` itself, which looks names up in all of them when they are first used
     ("cli",),

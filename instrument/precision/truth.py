@@ -1,15 +1,19 @@
-"""Visibilities in extended precision (64-bit mantissa): an independent truth for the bounds of a plan.
+"""Visibilities in extended precision (64-bit mantissa), entry by entry: an independent truth for plans and engines.
 
 Written from the formulas of docs/conventions.md, entry by entry. Taken from the package are the inputs alone: positions
 and axes of stations, directions, fluxes, coefficients, drawn gains, and of each time the rotation and the velocity of
 the Earth. All that follows is `longdouble`, so its own error is 2000 times below that of float64.
 """
 
-from typing import NamedTuple
+from __future__ import annotations
+
+import sys
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from instrument import ElementBeam
+from instrument.jones.base import ElementBeam
+from instrument.predict.base import Problem
 
 LIGHT = np.longdouble(299792458)
 PI = np.longdouble("3.14159265358979323846264338327950288")
@@ -17,43 +21,51 @@ I = np.clongdouble(1j)
 assert np.finfo(np.longdouble).eps < 1.1e-19, "this platform has no extended precision"
 
 
-def real(x):
+def real(x: Any) -> Any:
+    """An array in extended precision."""
     return np.asarray(x, np.longdouble)
 
 
-def cis(cycles):
+def cis(cycles: Any) -> Any:
     """exp(2 pi i cycles)."""
     angle = 2 * PI * (cycles - np.rint(cycles))
     return np.cos(angle) + I * np.sin(angle)
 
 
-def matrix(a, b, c, d):
+def matrix(a: Any, b: Any, c: Any, d: Any) -> Any:
+    """[[a, b], [c, d]] of broadcastable arrays, (..., 2, 2)."""
     a, b, c, d = np.broadcast_arrays(*(np.asarray(x, np.clongdouble) for x in (a, b, c, d)))
     return np.stack([np.stack([a, b], -1), np.stack([c, d], -1)], -2)
 
 
-def product(a, b):
+def product(a: Any, b: Any) -> Any:
+    """Matrix product (..., 2, 2)."""
     return (a[..., :, :, None] * b[..., None, :, :]).sum(-2)  # matmul has no extended precision
 
 
-def herm(a):
+def herm(a: Any) -> Any:
+    """Conjugate transpose."""
     return np.conj(np.swapaxes(a, -1, -2))
 
 
-def dot(a, b):
+def dot(a: Any, b: Any) -> Any:
+    """Scalar product over the last axis."""
     return (a * b).sum(-1)
 
 
-def unit(x):
+def unit(x: Any) -> Any:
+    """Vectors (..., 3) of length 1."""
     return x / np.sqrt(dot(x, x))[..., None]
 
 
-def vectors(ra, dec):
+def vectors(ra: Any, dec: Any) -> Any:
+    """ICRS unit vectors (S, 3) of right ascensions and declinations."""
     ra, dec = real(ra), real(dec)
     return np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], -1)
 
 
-def east_north(ra, dec):
+def east_north(ra: Any, dec: Any) -> Any:
+    """Unit vectors (S, 3) to the east and to the north."""
     ra, dec = real(ra), real(dec)
     east = np.stack([-np.sin(ra), np.cos(ra), 0 * ra], -1)
     return east, np.stack([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)], -1)
@@ -73,19 +85,20 @@ class Geometry(NamedTuple):
     zenith: object  # zenith angle (T, A, S)
 
 
-def rotated(at, x):
+def rotated(at: Any, x: Any) -> Any:
     """ICRS vectors (..., 3) in ITRF, (T, ..., 3)."""
     m = real(at.earth.matrices)
     return dot(m.reshape(len(m), *([1] * (x.ndim - 1)), 3, 3), x[None, ..., None, :])
 
 
-def apparent(at, x):
+def apparent(at: Any, x: Any) -> Any:
     """Apparent ITRF unit vectors (T, S, 3) of ICRS vectors (S, 3)."""
     v, m = real(at.earth.velocity), real(at.earth.matrices)
     return unit(dot(m[:, None], (x[None] + v[:, None])[:, :, None]))
 
 
-def geometry(at):
+def geometry(at: Any) -> Any:
+    """Where the directions of a sampling are seen."""
     source = vectors(at.ra_rad, at.dec_rad)
     middle = vectors(at.centre.ra_rad, at.centre.dec_rad)
     seen, centre = apparent(at, source), apparent(at, middle[None])[:, 0]
@@ -107,7 +120,7 @@ def geometry(at):
     return Geometry(seen, centre, east, np.cross(seen, east), lmn, axes, local, azimuth, np.arctan2(rho, r))
 
 
-def jinc(x):
+def jinc(x: Any) -> Any:
     """2 J1(x) / x: by its power series to |x| = 2, beyond by the integral of J1, whose trapezoidal sum converges."""
     out = np.empty(x.shape, np.longdouble)
     for index, value in np.ndenumerate(x):
@@ -126,17 +139,20 @@ def jinc(x):
 # Terms ---------------------------------------------------------------------------------------------------------------
 
 
-def gain(term, at, g):
+def gain(term: Any, at: Any, g: Any) -> Any:
+    """Gains (T, F, A, 1, 2, 2)."""
     t = term.table(at).astype(np.clongdouble)[:, :, :, None]
     return matrix(t[..., 0], 0, 0, t[..., 1])
 
 
-def feed(term, at, g):
+def feed(term: Any, at: Any, g: Any) -> Any:
+    """Feeds (T, F, A, 1, 2, 2)."""
     t = term.table(at).astype(np.clongdouble)[:, :, :, None]
     return matrix(1, t[..., 0], -t[..., 1], 1)
 
 
-def parallactic(term, at, g):
+def parallactic(term: Any, at: Any, g: Any) -> Any:
+    """Rotation of a direction's north and east into the axes of a station, (T, 1, A, S, 2, 2)."""
     axes = real(at.layout.axes)
     cos, sin = (x[..., None] for x in g.azimuth)
     phi = cos * axes[None, :, 1, None] - sin * axes[None, :, 0, None]
@@ -145,7 +161,8 @@ def parallactic(term, at, g):
     return matrix(dot(theta, north), dot(theta, east), dot(phi, north), dot(phi, east))[:, None]
 
 
-def crossed_dipole(term, at, g):
+def crossed_dipole(term: Any, at: Any, g: Any) -> Any:
+    """Two crossed dipoles above a ground plane, (T, F, A, S, 2, 2)."""
     cos, sin = g.azimuth
     c, s = np.cos(real(term.x_azimuth)), np.sin(real(term.x_azimuth))
     cos_a, sin_a = cos * c + sin * s, sin * c - cos * s
@@ -155,33 +172,36 @@ def crossed_dipole(term, at, g):
     return plane[..., None, None] * matrix(up * cos_a, -sin_a, up * sin_a, cos_a)[:, None]
 
 
-def dish(pattern, g):
+def dish(pattern: Any, g: Any) -> Any:
+    """A pattern (F, S) of a dish above the horizon, (T, F, A, S, 2, 2)."""
     whole = pattern[None, :, None] * (g.zenith < PI / 2)[:, None]
     return matrix(whole, 0, 0, whole)
 
 
-def from_centre(at):
+def from_centre(at: Any) -> Any:
+    """Angle of directions (S,) from the phase centre."""
     s, c = vectors(at.ra_rad, at.dec_rad), vectors(at.centre.ra_rad, at.centre.dec_rad)
     across = np.cross(s, c)
     return np.arctan2(np.sqrt(dot(across, across)), dot(s, c))
 
 
-def airy(term, at, g):
+def airy(term: Any, at: Any, g: Any) -> Any:
+    """An evenly lit dish."""
     reach = np.minimum(from_centre(at), PI / 2)
     x = PI * real(term.diameter) * real(at.freq_hz)[:, None] / LIGHT * np.sin(reach)
     return dish(jinc(x), g)
 
 
-def gaussian_dish(term, at, g):
+def gaussian_dish(term: Any, at: Any, g: Any) -> Any:
+    """A Gaussian beam."""
     f = real(at.freq_hz)
     width = real(term.fwhm) * (real(term.frequency) / f if term.frequency else 1 + 0 * f)
     return dish(np.exp(-2 * np.log(real(2)) * (from_centre(at) / width[:, None]) ** 2), g)
 
 
-def hamaker(term, at, g):
-    from instrument_plugins.elements.hamaker import coefficients
-
-    table, middle, half = coefficients(term.band)
+def hamaker(term: Any, at: Any, g: Any) -> Any:
+    """The element of Hamaker's polynomials, (T, F, A, S, 2, 2)."""
+    table, middle, half = sys.modules[type(term).__module__].coefficients(term.band)
     table, x = table.astype(np.clongdouble), (real(at.freq_hz) - real(middle)) / real(half)
     c, s = np.cos(PI * 5 / 4), np.sin(PI * 5 / 4)
     cos, sin = g.azimuth
@@ -198,7 +218,8 @@ def hamaker(term, at, g):
     return out * (g.zenith < PI / 2)[:, None, ..., None, None]
 
 
-def array_factor(term, at, g):
+def array_factor(term: Any, at: Any, g: Any) -> Any:
+    """Mean phasor of the parts of a station at each level, (T, F, A, S, 2, 2)."""
     sign = -1 if term.phase == "fringe" else 1
     f, out = real(at.freq_hz)[None, :, None, None], np.clongdouble(1)
     for level in term.levels:
@@ -212,7 +233,8 @@ def array_factor(term, at, g):
     return matrix(out, 0, 0, out)
 
 
-def station_beam(term, at, g):
+def station_beam(term: Any, at: Any, g: Any) -> Any:
+    """Array factor times element."""
     element = of_term(term.element, at, g)
     return product(array_factor(term.array, at, g), element.conj() if term.phase == "fringe" else element)
 
@@ -230,14 +252,15 @@ TERMS = {
 }
 
 
-def of_term(term, at, g):
+def of_term(term: Any, at: Any, g: Any) -> Any:
+    """Jones matrices of a term: its own `truth(at, geometry)` where it has one."""
     return term.truth(at, g) if hasattr(term, "truth") else TERMS[type(term).__name__](term, at, g)
 
 
 # Sky and sums --------------------------------------------------------------------------------------------------------
 
 
-def stokes(sky, freq_hz):
+def stokes(sky: Any, freq_hz: Any) -> Any:
     """Stokes parameters (F, S, 4)."""
     f = real(freq_hz)[:, None]
     out = np.repeat(real(sky.stokes_jy)[None], len(freq_hz), 0)
@@ -263,7 +286,7 @@ def stokes(sky, freq_hz):
     return out
 
 
-def envelope(sky, at, waves):
+def envelope(sky: Any, at: Any, waves: Any) -> Any:
     """What Gaussian shapes take off baselines (T, F, B, 3) in wavelengths, (T, F, B, S)."""
     angle = real(np.zeros(len(sky))) if sky.angle_rad is None else real(sky.angle_rad)
     cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
@@ -277,9 +300,10 @@ def envelope(sky, at, waves):
     return np.exp(-2 * PI**2 * exponent)
 
 
-def visibilities(problem):
+def visibilities(problem: Problem) -> Any:
     """Visibilities in Jy, clongdouble (T, F, B, 2, 2), of a problem whose sky is a list."""
-    at, sky = problem.at, problem.sky
+    at = problem.at
+    sky: Any = problem.sky
     g = geometry(at)
     jones = matrix(1, 0, 0, 1)
     for term in problem.chain.terms:

@@ -1,0 +1,172 @@
+"""A contest: plugins that do one job, a knob, and a judge who knows the truth; and how its trials are measured."""
+
+from __future__ import annotations
+
+import gc
+import time
+import tracemalloc
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from instrument.errors import InputError, RefusedError
+
+ROUNDS = (5, 30)  # fewest and most repeats of the full form
+QUICK = 3
+SPREAD = 0.05  # of the median: the half width of its 95 % interval at which the full form is content
+LONG = 20.0  # seconds of one trial that are not repeated beyond the fewest
+RIGHT, REFUSED, OVER, WRONG = "right", "refused", "over the tolerance", "said converged, was wrong"
+
+
+class Trial(NamedTuple):
+    """What an answer is worth: its error, that in the user's quantity, and how it ended, in words."""
+
+    error: float
+    error_user: float
+    outcome: str = RIGHT
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A contestant: the name of a plugin, and its answer to a value of the knob."""
+
+    plugin: str
+    answer: Callable[[float], Any]
+    values: tuple[float, ...] = ()  # of a knob of its own, instead of those of the contest
+
+
+@dataclass(frozen=True)
+class Contest:
+    """One job: a `knob` with `values`, entries, and a judge from an answer and what was asked to a `Trial`.
+
+    `error`, `error_user` and `truth` say in words what is measured and against what. With `honoured` the knob is an
+    error that was promised: one above it is a fault.
+    """
+
+    name: str
+    kind: str
+    knob: str
+    values: tuple[float, ...]
+    entries: tuple[Entry, ...]
+    judge: Callable[[Any, float], Trial]
+    error: str
+    error_user: str
+    truth: str
+    honoured: bool = False
+
+
+class Row(NamedTuple):
+    """One line of the table: seconds of wall time (median), their spread relative to it, bytes that Python knows of."""
+
+    contest: str
+    plugin: str
+    knob: str
+    asked: float
+    error: float
+    error_user: float
+    seconds: float
+    seconds_spread: float
+    peak_bytes: float
+    outcome: str
+
+
+class _Case:
+    """One entry at one value: its answer judged once, its seconds as often as it takes."""
+
+    def __init__(self, contest: Contest, entry: Entry, asked: float) -> None:
+        self.contest, self.entry, self.asked = contest, entry, asked
+        self.seconds: list[float] = []
+        self.peak = np.nan
+        try:
+            tracemalloc.start()
+            try:
+                found = entry.answer(asked)
+                self.peak = float(tracemalloc.get_traced_memory()[1])
+            finally:
+                tracemalloc.stop()
+            self.trial = contest.judge(found, asked)
+        except (RefusedError, InputError) as error:
+            self.trial = Trial(np.nan, np.nan, f"{REFUSED}: {error}")
+        except Exception as error:  # a stranger's plugin may fail in any way, and stays in the table
+            self.trial = Trial(np.nan, np.nan, f"failed: {type(error).__name__}: {error}")
+        if contest.honoured and self.trial.error > asked and self.trial.outcome == RIGHT:
+            self.trial = self.trial._replace(outcome=OVER)
+
+    @property
+    def runs(self) -> bool:
+        """Whether there is an answer whose time can be taken."""
+        return bool(np.isfinite(self.trial.error))
+
+    def run(self) -> None:
+        """Take its time once more; what it gives is thrown away outside of the time taken."""
+        start = time.perf_counter()
+        found = self.entry.answer(self.asked)
+        self.seconds.append(time.perf_counter() - start)
+        del found
+
+    @property
+    def spread(self) -> float:
+        """Half width of the 95 % interval of the median, relative to it; without enough repeats that of all."""
+        found = np.sort(self.seconds)
+        n = len(found)
+        if not n:
+            return np.nan
+        low = max(int(np.floor((n - 1.96 * np.sqrt(n)) / 2)), 0)
+        high = min(int(np.ceil(1 + (n + 1.96 * np.sqrt(n)) / 2)), n) - 1
+        return float((found[high] - found[low]) / 2 / np.median(found))
+
+    def enough(self, quick: bool) -> bool:
+        """Whether its time is known well enough."""
+        n = len(self.seconds)
+        if not self.runs or quick:
+            return not self.runs or n >= QUICK
+        if n < ROUNDS[0]:
+            return False
+        return n >= ROUNDS[1] or self.spread < SPREAD or float(np.median(self.seconds)) > LONG
+
+    def row(self) -> Row:
+        """Its line of the table."""
+        contest, trial = self.contest, self.trial
+        seconds = float(np.median(self.seconds)) if self.seconds else np.nan
+        return Row(
+            *(contest.name, self.entry.plugin, contest.knob, self.asked, trial.error, trial.error_user),
+            *(seconds, self.spread, self.peak, trial.outcome),
+        )
+
+
+def measured(contest: Contest, quick: bool = False, said: Callable[[str], None] = lambda text: None) -> list[Row]:
+    """All entries at all values: judged once (which compiles what is compiled), then timed in turn, round by round."""
+    cases = []
+    for entry in contest.entries:
+        for asked in entry.values or contest.values:
+            said(f"{contest.name}: {entry.plugin}, {contest.knob} {asked:g}")
+            cases.append(_Case(contest, entry, asked))
+    for number, due in enumerate(_rounds(cases, quick)):
+        said(f"{contest.name}: round {number + 1}, {len(due)} times to take")
+        for case in due:
+            gc.collect()
+            case.run()
+    return [case.row() for case in cases]
+
+
+def _rounds(cases: Sequence[_Case], quick: bool) -> Iterator[list[_Case]]:
+    while due := [case for case in cases if not case.enough(quick)]:
+        yield due
+
+
+def front(rows: Sequence[Row]) -> list[Row]:
+    """Those of some rows with an answer that none beats in both error and seconds, quickest first."""
+    good = sorted((r for r in rows if np.isfinite(r.error) and np.isfinite(r.seconds)), key=lambda r: r.seconds)
+    best: list[Row] = []
+    for row in good:
+        if not best or row.error < best[-1].error:
+            best.append(row)
+    return best
+
+
+def choice(rows: Sequence[Row], error: float) -> Row | None:
+    """The quickest of some rows whose error is at most so much."""
+    good = [r for r in front(rows) if r.error <= error]
+    return good[0] if good else None

@@ -1,0 +1,133 @@
+"""Error against run time: contests keep failures, find broken promises, and name what to take."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from astropy.table import QTable
+
+import instrument.precision.command as command
+from instrument import InputError
+from instrument.cli import main
+from instrument.errors import RefusedError
+from instrument.precision import Contest, Entry, Row, Trial, contests_of
+from instrument.precision.contest import OVER, WRONG, choice, front, measured
+from instrument.precision.engines import SHORT
+
+
+def good(asked):
+    return asked / 2
+
+
+def slow(asked):
+    time.sleep(0.002)
+    return asked / 10
+
+
+def liar(asked):
+    return 3 * asked
+
+
+def picky(asked):
+    if asked < 1e-3:
+        raise RefusedError("its bound is 1e-3: the floor")
+    return asked
+
+
+def broken(asked):
+    raise ZeroDivisionError("no")
+
+
+def contest(**entries):
+    return Contest(
+        name="halves", kind="engines", knob="tolerance", values=(1e-2, 1e-4),
+        judge=lambda found, asked: Trial(found, found),
+        entries=tuple(Entry(name, answer) for name, answer in entries.items()), error="of a number",
+        error_user="the same", truth="zero", honoured=True,
+    )  # fmt: skip
+
+
+def test_what_is_refused_fails_or_lies_stays_in_the_table():
+    rows = measured(contest(good=good, picky=picky, broken=broken, liar=liar), quick=True)
+    found = {(row.plugin, row.asked): row for row in rows}
+    assert len(rows) == 8
+    assert found["good", 1e-2].outcome == "right" and found["good", 1e-4].error == 5e-5
+    assert found["picky", 1e-4].outcome == "refused: its bound is 1e-3: the floor"
+    assert found["broken", 1e-2].outcome == "failed: ZeroDivisionError: no"
+    assert {found["liar", asked].outcome for asked in (1e-2, 1e-4)} == {OVER}
+    assert np.isnan(found["broken", 1e-2].seconds) and found["good", 1e-2].seconds > 0
+
+
+def test_the_front_is_of_those_that_none_beats():
+    rows = measured(contest(good=good, slow=slow, liar=liar), quick=True)
+    best = front(rows)
+    assert [row.seconds for row in best] == sorted(row.seconds for row in best)
+    assert [row.error for row in best] == sorted((row.error for row in best), reverse=True)
+    assert best[-1].plugin == "slow" and best[-1].asked == 1e-4
+    assert choice(rows, 1e-5).plugin == "slow" and choice(rows, 1e-9) is None
+
+
+def test_the_full_form_repeats_until_the_median_is_known(monkeypatch):
+    """The 95 % interval of the median of n numbers, by their order."""
+    clock = iter(np.cumsum([x for k in range(200) for x in (0.0, 1.0 + 0.2 * (k % 7 == 3))]))
+    monkeypatch.setattr(time, "perf_counter", lambda: next(clock))
+    (row,) = measured(replace(contest(good=good), values=(1e-2,)))
+    assert row.seconds == pytest.approx(1.0) and row.seconds_spread < 0.05
+
+
+def test_a_table_a_figure_and_a_page_are_written(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(command, "contests_of", lambda *given: [contest(good=good, slow=slow, picky=picky)])
+    assert main(["precision", "engines", "--quick", "--out", str(tmp_path / "p")]) == 0
+    table = QTable.read(tmp_path / "p" / "precision.ecsv")
+    assert table.colnames == list(Row._fields) and len(table) == 6 and table.meta["versions"]["numpy"]
+    assert (tmp_path / "p" / "precision.png").stat().st_size > 10000
+    page = (tmp_path / "p" / "precision.html").read_text()
+    assert "instrument precision engines --quick" in page and "its bound is 1e-3: the floor" in page
+    said = capsys.readouterr().out
+    assert "halves: for an error of 1e-06" not in said and "take good, tolerance" in said
+
+
+@pytest.mark.parametrize("word", [OVER, WRONG])
+def test_a_broken_promise_is_status_3(tmp_path, monkeypatch, word):
+    bad = contest(liar=liar) if word == OVER else replace(
+        contest(good=good), judge=lambda found, asked: Trial(found, found, WRONG)
+    )  # fmt: skip
+    monkeypatch.setattr(command, "contests_of", lambda *given: [bad])
+    assert main(["precision", "engines", "--quick", "--out", str(tmp_path / "p")]) == 3
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["nothing"], "no scene, kind of plugin or plugin with a contest is called 'nothing'"),
+        (["enginse"], "'engines'"),
+        (["engines", "--plugins", "matrixx"], "no engine is called 'matrixx'"),
+    ],
+)
+def test_wrong_words_are_one_line_and_leave_nothing(tmp_path, capsys, words, said):
+    assert main(["precision", *words, "--out", str(tmp_path / "p")]) == 2
+    err = capsys.readouterr().err
+    assert said in err and err.count("\n") == 1 and "Traceback" not in err
+    assert not list(tmp_path.iterdir())
+
+
+def test_contests_are_of_plugins_that_can_be_had():
+    with pytest.raises(InputError, match="no scene"):
+        contests_of("elements-of-style")
+
+
+@pytest.mark.long
+def test_engines_keep_their_tolerance_against_extended_precision():
+    (one,) = contests_of("engines", quick=True)
+    for entry in one.entries:
+        for asked in SHORT[:8]:
+            assert one.judge(entry.answer(asked), asked).error <= asked
+
+
+@pytest.mark.long
+def test_solvers_that_say_converged_are_right():
+    (one,) = contests_of("calibrators", quick=True)
+    for entry in one.entries:
+        for asked in one.values:
+            assert one.judge(entry.answer(asked), asked).outcome == "right"
