@@ -11,13 +11,13 @@ from instrument.calibrate.cluster_equations import Equations, unit_diagonal
 from instrument.calibrate.cluster_errors import Errors, errors_of
 from instrument.calibrate.cluster_rounds import Rounds
 from instrument.calibrate.fit import Left, strange
+from instrument.calibrate.gauge import BLIND
 from instrument.calibrate.graph import counted, tied
-from instrument.calibrate.reasons import ENOUGH
+from instrument.calibrate.reasons import ALIKE, ENOUGH
 from instrument.errors import Outcome
 from instrument.units import Bool, Complex, Float
 
 COINCIDENT = 1e-10  # smallest eigenvalue, relative to the diagonal, of equations of a station that have an answer
-ALIKE = 1e-4  # of the models over the whole array: with less, noise mixes the matrices of two clusters
 
 
 @dataclass
@@ -109,10 +109,16 @@ def _loose(block: Block) -> bool:
 
 
 def _alike(block: Block) -> bool:
-    """Whether the models of clusters are alike to the whole array: noise then mixes their matrices."""
+    """Whether the models of clusters are alike to the whole array, or one shows a single polarization.
+
+    Noise then mixes their matrices; of a polarization that is not shown nothing is known.
+    """
     plain: Complex = np.eye(2)[None, :, None, :] * block.active.T[:, None, :, None] + 0j
     whole = Equations(block, plain, block.seen(plain)[0], block.w).normal.sum(axis=0)
-    return bool(np.linalg.eigvalsh(unit_diagonal(whole)[0]).min() < ALIKE)
+    own = whole.reshape(block.columns, 2, block.columns, 2)[range(block.columns), :, range(block.columns)]
+    values = np.linalg.eigvalsh(own)
+    dark = np.any(values[:, 0] < BLIND * values[:, 1]) and block.limits.pattern == "full"
+    return bool(dark or np.linalg.eigvalsh(unit_diagonal(whole)[0]).min() < ALIKE)
 
 
 def _coincident(block: Block, x: Complex) -> bool:

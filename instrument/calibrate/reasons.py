@@ -18,7 +18,8 @@ ENOUGH = 50  # iterations after which a fit that leaves most of the data will le
 ONE_RECEPTOR = 1e-6  # of the power at a station: what a model shows of its other polarization
 FAINT = 0.3  # standard error of a gain, relative to itself, beyond which it is noise
 HARDLY = 1e-6  # of the power at a typical station
-ALIKE = 0.1  # least eigenvalue, two models that differ by half of themselves: with few data that may be too little
+ALIKE = 1e-4  # least eigenvalue of what models show the whole array: with less, noise mixes the matrices of clusters
+NEAR = 0.1  # the same of two models that differ by half of themselves: with few data that may be too little
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,10 @@ class Asked:
         values, vectors = np.linalg.eigh(unit_diagonal(moments.sum(axis=0))[0])
         shares = (np.abs(vectors[:, 0]) ** 2).reshape(-1, 2).sum(axis=1)
         both = [f"'{self.clusters[k]}'" for k in np.argsort(-shares) if shares[k] > 0.1]
-        if values[0] > ALIKE or len(both) < 2:
+        if len(both) < 2 and values[0] < ALIKE and self.pattern == "full":
+            name = self.clusters[int(np.argmax(shares))]
+            return f"{_model(name)} shows hardly more than one polarization: it is polarized to nearly 100 %"
+        if len(both) < 2 or values[0] > NEAR:
             return ""
         apart = 100 * np.sqrt(2 * max(float(values[0]), 0.0))
         return f"the models of {' and '.join(both[:2])} differ by {apart:.2g} % of themselves: join them"

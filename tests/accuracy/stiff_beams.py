@@ -203,3 +203,20 @@ ENDS = {
 def ends(kind, solver, noisy):
     """Whether a case is right, and words that are printed."""
     return ENDS.get(kind, [RIGHT] * 4)[2 * (solver == "towards") + noisy]
+
+
+def table():
+    """Lines of docs/calibrating.md: how the cases end."""
+    out = ["| case | SelfCal | DirectionalCal, three clusters |", "| --- | --- | --- |"]
+    for kind in KINDS:
+        cells = []
+        for solver in ("self", "towards"):
+            clean, noisy = (_cell(*ends(kind, solver, noise)) for noise in (False, True))
+            cells.append(clean if clean == noisy else f"{clean}; with noise {noisy}")
+        out.append(f"| {kind} | {cells[0]} | {cells[1]} |")
+    return out
+
+
+def _cell(right, words):
+    said = f'"{words}"'
+    return (f"right, said: {said}" if words else "right") if right else f"no solution: {said}"

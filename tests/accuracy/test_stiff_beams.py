@@ -99,3 +99,26 @@ def test_a_cluster_that_is_seen_in_some_intervals_only():
     found = one.solver.with_fields(interval=20 * u.s).solve(one.data, {**one.sky, "c": gone})["c"]
     assert found.outcome.ravel().tolist() == [Outcome.REFUSED, Outcome.CONVERGED, Outcome.CONVERGED]
     assert "no solution of 1 interval: its model is zero wherever data count" in str(found)
+
+
+@pytest.mark.parametrize("leaks", [0.0, 1e-9, 0.01])
+def test_one_cluster_of_one_polarization(leaks):
+    """What a model does not show has no solution: no errors that are large, but not infinite."""
+    one = stiff.case("one source", "towards", True)
+    shown = np.array([[1, leaks], [leaks, leaks**2]])
+    sky = {"a": one.sky["a"].with_data(one.sky["a"].data[..., :1, :1] * shown)}
+    found = one.solver.solve(one.data, sky)["a"]
+    assert found.outcome[0, 0] is Outcome.SINGULAR and np.isnan(found.error).all()
+    assert "the model of 'a' shows" in str(found) and "polarization" in str(found)
+
+
+def test_errors_that_are_not_known_are_said(monkeypatch):
+    monkeypatch.setattr("instrument.calibrate.cluster_errors.MOST", 100)
+    found = stiff.judged(stiff.case("ordinary", "towards", True))
+    assert found.outcome == "CONVERGED"
+    assert "errors of gains, and weak directions, of 1 solutions are not known: too many unknowns" in found.said
+
+
+def test_the_table_of_the_docs_is_the_one_that_is_tested():
+    page = (Path(__file__).parents[2] / "docs/calibrating.md").read_text()
+    assert "\n".join(stiff.table()) in page
