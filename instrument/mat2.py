@@ -85,6 +85,8 @@ def singular_values(a: Complex) -> tuple[Float, Float]:
         high = np.sqrt(0.5 * (rows.sum(axis=-1) + gap))
         # |det| / high, not the root of a difference: keeps every digit of a small value
         low = np.where(high > 0, np.abs(det(scaled)) / high, 0.0)
+        # of a multiple of a unitary matrix both are one: a root and a quotient may round apart, and IXR be 1e32
+        low = np.where(gap > 0, np.minimum(low, high), high)
         return high * size, low * size
 
 

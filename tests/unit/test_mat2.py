@@ -121,6 +121,13 @@ def test_a_condition_number_near_1_keeps_the_digits_of_its_excess(excess):
     np.testing.assert_allclose(mat2.condition(of_condition(1 + excess)) - 1, excess, rtol=0, atol=2e-15)
 
 
+def test_the_singular_values_of_a_multiple_of_a_unitary_matrix_are_one_number():
+    """[[1, d], [-d*, 1]]: its IXR is infinite, where a root and a quotient that round apart make 1e32 of it."""
+    d = np.random.default_rng(3).uniform(-1, 1, (200, 2)) @ [1, 1j]
+    high, low = mat2.singular_values(mat2.pack(1, d, -d.conj(), 1))
+    assert np.array_equal(high, low)
+
+
 def test_a_unitary_matrix_has_condition_1():
     turned = np.exp(0.3j) * rotation(0.7)
     assert mat2.condition(turned) == pytest.approx(1.0, abs=5e-8)
