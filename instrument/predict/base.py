@@ -10,6 +10,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from instrument import mat2
 from instrument.checked import checked
 from instrument.component import Component
 from instrument.jones.chain import Chain
@@ -156,7 +157,15 @@ class Blockwise(Prepared):
 
     def sums(self, times: slice, channels: slice, pairs: tuple[Int, Int] | None = None) -> Complex:
         """Visibilities in Jy, complex (T, F, B, 2, 2)."""
-        return self.engine.sums(self.block(times, channels, pairs))
+        given = self.block(times, channels, pairs)
+        turned = given.antenna1 > given.antenna2
+        if not turned.any():
+            return self.engine.sums(given)
+        # V_ba is V_ab^H to the last bit: the order of products is that of one of them
+        a, b = (pick(given.antenna1, given.antenna2) for pick in (np.minimum, np.maximum))
+        out = self.engine.sums(given.between(a, b))
+        out[:, :, turned] = mat2.herm(out[:, :, turned])
+        return out
 
     def task(self, times: slice, channels: slice) -> Callable[[], Visibilities]:
         """The engine and the block alone."""

@@ -172,3 +172,15 @@ def test_blocks_do_not_change_the_visibilities():
     small = replace(plan, block_shape=(1, 1))
     assert len(small.slices) == 4
     assert np.array_equal(plan.run().data, small.run().data)
+
+
+@pytest.mark.parametrize("engine", ["direct", "matrix"])
+def test_a_baseline_the_other_way_round_is_the_hermitian_conjugate_to_the_last_bit(engine):
+    from instrument import mat2
+    from instrument.conformance.bench import problems
+    from instrument.predict.base import EVERY
+
+    problem = problems()["polarized points, phased stations"]
+    turned = problem.between(problem.antenna2, problem.antenna1)
+    one, other = (instrument.load("engines", engine).prepare(p, 0.0).sums(EVERY, EVERY) for p in (problem, turned))
+    assert np.array_equal(mat2.herm(other), one)
