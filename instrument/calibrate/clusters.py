@@ -82,10 +82,14 @@ def suspects(block: Block, start: Complex) -> Bool:
 
 def _odd(block: Block, left: Complex) -> bool:
     """Whether some baselines, or most of what a station has, do not agree with the fit."""
-    weight, limits = block.weights(left), block.limits
+    weight, limits, used = block.weights(left), block.limits, block.w > 0
     ends = (None, block.a1, block.a2)
+    if limits.robust is not None:
+        put_aside = used & (weight < 0.05 * block.w)
+        if put_aside.sum() <= 0.1 * used.sum():  # few: they are no misfit, though they were all that a baseline has
+            weight, used = np.where(put_aside, 0.0, weight), used & ~put_aside
     rest, data, fit = ((weight * power_of(x)).sum(axis=(0, 3))[ends] for x in (left, block.v, block.v - left))
-    seen = Left(rest, data, fit, (block.w > 0).sum(axis=(0, 3))[ends])
+    seen = Left(rest, data, fit, used.sum(axis=(0, 3))[ends])
     sets = block.column.shape[1]
     if strange(seen, block.a1, block.a2, block.stations, limits.tolerance, limits.pattern, sets).any():
         return True

@@ -39,6 +39,16 @@ def test_d6_robust_weights_that_put_an_outlier_aside_make_no_poor_fit():
     assert lab.rms(solution.predicted(sky) - data) < 1e-6 * lab.rms(data)
 
 
+def test_d6_an_outlier_that_is_all_that_its_baseline_has_is_put_aside():
+    """Intervals of one integration: the baseline then has no other sample, and was called a misfit."""
+    data, sky = scene()
+    one, part = slice(2, 3), {name: sky[name].block(slice(2, 3), slice(None)) for name in sky}
+    solution = SETTINGS.with_fields(robust=2.0, interval=None).solve(hit(data, 1e3).block(one, slice(None)), part)
+    solution.check()
+    left = (solution.predicted(part) - data.block(one, slice(None))).data
+    assert lab.rms(data.with_data(np.broadcast_to(left, data.data.shape))) < 1e-5 * lab.rms(data)
+
+
 @pytest.mark.parametrize("factor", [10.0, 1e3])
 def test_d2_one_wild_visibility_is_reported_in_a_directional_solve(factor):
     data, sky = scene()
