@@ -66,6 +66,11 @@ def parser() -> argparse.ArgumentParser:
     verb.add_argument("--plugins", metavar="A,B", help="of these plugins alone (default: all that can be had)")
     verb.add_argument("--quick", action="store_true", help="one value a decade, three repeats")
     _add_out(verb, "folder to write, new or empty (default: runs/precision-WHAT, or the next free name)")
+    text = "Try named extreme cases with right answers: right, refused or WRONG, in digits."
+    cases = verbs.add_parser("stress", help=text, description=text)
+    cases.add_argument("what", metavar="WHAT", nargs="?", help="a scene, a kind of plugins, a plugin (default: all)")
+    cases.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings", help="of the plugin")
+    _add_out(cases, "folder to write stress.ecsv into, new or empty (default: none is written)")
     verbs.add_parser("scenes", help="List the shipped scenes.")
     plugins = verbs.add_parser("plugins", help="List the plugins, and what is broken; with a NAME its settings.")
     plugins.add_argument("name", metavar="NAME", nargs="?", help="a plugin: its settings, their units and defaults")
@@ -251,6 +256,14 @@ def _precision(given: argparse.Namespace) -> int:
     return DONE if kept else FELL_SHORT
 
 
+def _stress(given: argparse.Namespace) -> int:
+    from instrument.pipeline.scene_text import override
+    from instrument.stress.suite import stress
+
+    right = stress(given.what, given.out, show, override({}, given.settings), given.force)
+    return DONE if right else FELL_SHORT
+
+
 def _scenes(given: argparse.Namespace) -> int:
     from instrument.pipeline.scene_text import shipped
 
@@ -291,6 +304,7 @@ VERBS = {
     "analyze": _analyze,
     "compare": _compare,
     "precision": _precision,
+    "stress": _stress,
     "scenes": _scenes,
     "plugins": _plugins,
     "doctor": _doctor,

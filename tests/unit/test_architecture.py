@@ -55,6 +55,7 @@ LAYERS = (
     ("pipeline",),
     ("conformance",),
     ("precision",),
+    ("stress",),
     ("doctor",),
     ("",),  # `instrument` itself, which looks names up in all of them when they are first used
     ("cli",),

@@ -1,0 +1,3 @@
+"""Named extreme cases with right answers: what comes out of each, in digits."""
+
+MODULES = ("cases_engines", "cases_beam", "cases_calibration")
