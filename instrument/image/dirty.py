@@ -32,8 +32,9 @@ class Imager(AnyImager):
     """Dirty images of `pixels` x `pixels` of `pixel` each, from baselines within `uv_range` (wavelengths).
 
     `weighting` "natural", "uniform" or "briggs" (with `robust`). The w-term is always there. `accuracy` is that of the
-    gridding, relative to the rms of the image. Flagged and non-finite visibilities have no weight. Where correlations
-    have weights or flags of their own, so have I, Q, U and V (`stokes_weight`); the PSF is then that of Stokes I.
+    gridding, of the worst pixel relative to the rms of the image. Flagged and non-finite visibilities have no weight.
+    Where correlations have weights or flags of their own, so have I, Q, U and V (`stokes_weight`); the PSF is then that
+    of Stokes I.
     """
 
     weighting: Weighting = "natural"
@@ -160,7 +161,8 @@ class Images(ImageSums):
                 npix_y=self.imager.pixels,
                 pixsize_x=self.imager.pixel,
                 pixsize_y=self.imager.pixel,
-                epsilon=self.imager.accuracy,
+                # half of it: ducc0's is an rms, and the largest error, at the edge, was up to 1.5 times that asked for
+                epsilon=max(self.imager.accuracy / 2, 1e-12),
                 do_wgridding=True,
                 divide_by_n=False,
                 flip_u=True,
