@@ -77,9 +77,10 @@ class GaussianProcess(ForegroundRemover):
         outcome = Outcome.ITERATION_LIMIT if done.status == 1 else Outcome.CONVERGED
         rms = np.sqrt(scale * np.exp(done.x[[0, 2, 4, 6]]))
         text = "rms smooth {:.3g}, mixing {:.3g}, signal {:.3g}, noise {:.3g}".format(*rms)
+        rms_jitter = np.sqrt(scale * JITTER)
         none = np.zeros((0, *maps.shape[1:]), maps.dtype)
         return Separation(
-            outcome, f"{text}; {evaluations} likelihoods", np.zeros((f, 0)), none,
+            outcome, f"{text}, jitter {rms_jitter:.1g}; {evaluations} likelihoods", np.zeros((f, 0)), none,
             operator=gain, covariance=scale * (fg - gain @ fg),
         )  # fmt: skip
 
