@@ -74,7 +74,7 @@ def both(*answers: Answer) -> Answer:
 class Case:
     """A named extreme input: its key in the list, the stage that it fits, the right answer in words, how it is tried.
 
-    `stage` is a kind of plugins ("engines", "calibrators", ...) or a part of the framework ("jones", "faraday",
+    `stage` is a kind of plugins ("engines", "calibrators", ...) or a part of the framework ("jones", "faraday-depth",
     "spectra", "run"). `tried` takes a plugin of that kind and gives an `Answer`; with `refusal` a refusal in one line
     is right as well. `missing` says what is not built yet, and then nothing is tried.
     """

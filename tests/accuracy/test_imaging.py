@@ -54,7 +54,7 @@ def test_images_are_the_plain_sum_within_the_accuracy_asked_for(accuracy):
 
 
 def test_no_pixel_is_off_by_more_than_the_accuracy_asked_for():
-    """The largest error, at the edge and in the corners, where ducc0's own measure, the rms, let 1.2 to 1.5 times it."""
+    """The largest error, at the edge and in the corners, where ducc0's measure, the rms, let 1.2 to 1.5 times it."""
     from instrument.stress.bench import field, observed, small_array
 
     vis = observed(small_array(8, spread=60.0), field(), 2)
