@@ -80,7 +80,7 @@ class GaussianProcess(ForegroundRemover):
         rms_jitter = np.sqrt(scale * JITTER)
         none = np.zeros((0, *maps.shape[1:]), maps.dtype)
         return Separation(
-            outcome, f"{text}, jitter {rms_jitter:.1g}; {evaluations} likelihoods", np.zeros((f, 0)), none,
+            outcome, f"{text}; {evaluations} likelihoods; jitter {rms_jitter:.1g}", np.zeros((f, 0)), none,
             operator=gain, covariance=scale * (fg - gain @ fg),
         )  # fmt: skip
 
