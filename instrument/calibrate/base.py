@@ -108,8 +108,12 @@ class Solution:
         if to.shape != self.jones.shape:
             raise InputError(f"the matrices to align to have shape {to.shape}, the solution {self.jones.shape}")
         turn = self.gauge.nearest(self.jones, to)
+        alike: dict[int, list[tuple[int, int]]] = {}
         for where, gauge in self.looser.items():
-            turn[where] = gauge.nearest(self.jones[where], to[where])
+            alike.setdefault(id(gauge), []).append(where)
+        for cells in alike.values():
+            rows = tuple(np.transpose(cells))
+            turn[rows] = self.looser[cells[0]].nearest(self.jones[rows], to[rows])
         turned = mat2.mul(self.jones, turn[:, :, None])
         return replace(self, term=self.term.with_fields(values=turned))
 

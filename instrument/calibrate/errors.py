@@ -16,32 +16,30 @@ def gain_errors(
 
     factor of the normal matrix of steps jones_a exp(e_a), whose R is used up; jones (A, 2, 2), basis (8, k) their real
     coordinates. That of a direction is of y in exp(sum_k y_k G_k), as the data alone have it without a prior, and
-    infinite where it is `free` (n,). That of a gain is the rms of its real and its imaginary part, without what it has
-    along directions that are free or whose error is above `most`; NaN unless `each`. What a prior P of weight w pulls
-    is no noise: the covariance is A - w A P^T P A for A the inverse.
+    infinite where it is `free` (n,), or above ten times what the prior holds it to. That of a gain is the rms of its
+    real and its imaginary part, without what it has along directions that are free or whose error is above `most`; NaN
+    unless `each`. What a prior P of weight w pulls is no noise: the covariance is A - w A P^T P A for A the inverse.
     """
     stations, size = len(jones), basis.shape[1]
     turn = _left(jones) @ basis  # (A, 8, k): of e to J e
     tangents = np.einsum("aij,njk->naik", jones, directions).reshape(len(directions), stations, 4)
     real = np.ascontiguousarray(tangents).view(float)  # (n, A, 8)
     right = np.einsum("nax,axk->nak", real, turn).reshape(len(directions), -1)
-    along = np.einsum("nak,axk->nax", factor.solve(right.T).T.reshape(len(right), stations, size), turn)
     flat = real.reshape(len(right), -1)
     gram = flat @ flat.T
     back = np.linalg.pinv(gram, hermitian=True)
+
+    along = np.einsum("nak,axk->nax", factor.solve(right.T).T.reshape(len(right), stations, size), turn)
     common = back @ flat @ along.reshape(len(right), -1).T @ back
-    along_each = np.maximum(np.diagonal(common), 0.0)
-    with np.errstate(divide="ignore"):
-        held = np.maximum(1 - factor.now * along_each, 1e-300)
-        alone = np.where(held > 1e-9, along_each / held, np.inf)
-    alone = np.where(free, np.inf, alone)
+    alone = _without_prior(common, factor.now, free)
     if not each:
         return np.full(jones.shape, np.nan), np.sqrt(alone)
     variance = ((turn @ _own_blocks(factor, stations)) * turn).sum(axis=2)
     # what a prior adds to the inverse as it weakens, and what it pulls
     grown = factor.grown()
     beside = np.einsum("akn,axk->nax", factor.back.reshape(stations, size, -1), turn)
-    pulled = factor.now * grown**2
+    # no more than all of it, where noise bends the data the other way
+    pulled = grown * np.minimum(factor.now * grown, 1 / np.maximum(factor.values, 1e-300))
     variance += np.einsum("n,nax->ax", (factor.weight - factor.now) * grown - pulled, beside**2)
     along = along - np.einsum("nm,max->nax", right @ factor.back * pulled, beside)
     both = flat @ along.reshape(len(right), -1).T
@@ -51,6 +49,19 @@ def gain_errors(
     twice = (real[few] * np.tensordot(near @ both[np.ix_(few, few)] @ near, real[few], 1)).sum(axis=0)
     variance = np.maximum(variance - 2 * once + twice, 0.0).reshape(stations, 2, 2, 2).mean(axis=3)
     return np.sqrt(variance), np.sqrt(alone)
+
+
+def _without_prior(common: Float, weight: float, free: Bool) -> Float:
+    """Variances (n,) along directions as the data alone have them, of covariances (n, n) with a prior of a weight.
+
+    Where the prior has 100 times the weight of the data, or noise bends them the other way, they are infinite.
+    """
+    out = np.full(len(common), np.inf)
+    values, vectors = np.linalg.eigh(np.linalg.inv(common[np.ix_(~free, ~free)]) - weight * np.eye((~free).sum()))
+    least = max(0.01 * weight, 1e-300)
+    variances = vectors**2 @ (1 / np.maximum(values, least))
+    out[~free] = np.where(vectors**2 @ (values < least) > 0.5, np.inf, variances)
+    return out
 
 
 def _own_blocks(factor: Factor, stations: int) -> Float:

@@ -70,13 +70,22 @@ class Gauge:
         }
         return names.get(self.count, f"free: {self.count} parameters common to all stations")
 
-    def with_errors(self, error: Float, most: float = HELD_TO) -> Gauge:
-        """This gauge, weak where the standard error (..., n) of a common direction is in the median above `most`."""
+    def with_errors(self, error: Float, most: float = HELD_TO) -> tuple[Gauge, dict[tuple[int, int], Gauge]]:
+        """This gauge, weak where the error (t, f, n) of a common direction is in the median above `most`.
+
+        And those of the intervals where other directions are: one for each set of them.
+        """
         known = np.isfinite(error).any(axis=-1)
         if not known.any():
-            return self
-        weak = (np.median(error[known], axis=0) > most) & (np.arange(len(self.seen)) >= self.count)
-        return replace(self, weak=self.directions[weak])
+            return self, {}
+        bound = np.arange(len(self.seen)) >= self.count
+        usual = (np.median(error[known], axis=0) > most) & bound
+        kinds: dict[bytes, Gauge] = {}
+        others = {}
+        for t, f in np.argwhere(known & (((error > most) & bound) != usual).any(axis=-1)):
+            weak = (error[t, f] > most) & bound
+            others[int(t), int(f)] = kinds.setdefault(weak.tobytes(), replace(self, weak=self.directions[weak]))
+        return replace(self, weak=self.directions[usual]), others
 
     def nearest(self, jones: Complex, to: Complex) -> Complex:
         """The X (..., 2, 2) of this gauge that brings jones (..., A, 2, 2) nearest to `to`; NaN does not vote."""

@@ -71,16 +71,18 @@ class SelfCal(Calibrator):
         error = np.concatenate([p.error for p in parts]).reshape(jones.shape)
         noise = noisy(jones, error, self.pattern)
         common_error = np.concatenate([p.common_error for p in parts]).reshape(*shape, -1)
+        gauge, others = job.gauge.with_errors(common_error)
+        looser = _by_cell({i * size + k: g for i, p in enumerate(parts) for k, g in p.gauges.items()}, shape)
         suspects = _mask({i * size + k: x for i, p in enumerate(parts) for k, x in p.suspects.items()}, cells, data)
         return Solution(
             term=JonesTable(values=jones, slots_s=grouped.centres_s, freq_hz=freqs, stations=tuple(data.layout.names)),
             outcome=outcome.reshape(shape),
             iterations=np.concatenate([p.iterations for p in parts]).reshape(shape),
             residual=np.concatenate([p.residual for p in parts]).reshape(shape),
-            gauge=job.gauge.with_errors(common_error),
+            gauge=gauge,
             history=history,
             interval_s=grouped.length_s,
-            looser=_by_cell({i * size + k: g for i, p in enumerate(parts) for k, g in p.gauges.items()}, shape),
+            looser=others | looser,
             suspects=suspects,
             spoilt=by_baseline(suspects, data),
             unexplained=np.concatenate([p.worst for p in parts]).reshape(shape),

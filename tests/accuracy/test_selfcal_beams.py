@@ -1,5 +1,7 @@
 """Self-calibration with beams in the model: right to the tolerance given, its errors those that noise makes."""
 
+from dataclasses import replace
+
 import h5py
 import numpy as np
 import pytest
@@ -105,6 +107,20 @@ def test_weak_directions_are_told_and_gains_are_off_by_their_errors(seen):
     each = np.sqrt(np.mean(np.square(pulls), axis=(0, 1, 2, 3)))  # (A, 2, 2): 120 draws of a number
     assert 0.95 < np.sqrt(np.mean(np.square(pulls))) < 1.05
     assert each.min() > 0.8 and each.max() < 1.2  # 3 of their own standard errors
+
+
+def test_each_interval_has_its_own_weak_directions(seen):
+    """What the error of a gain leaves out is what `aligned` turns along, in that interval."""
+    solution = SelfCal(tolerance=1e-8).solve(seen.corrupted(errors(0.1)), seen)
+    error = np.full((3, 1, 8), 0.01)
+    error[..., 0], error[1, 0, 2], error[2, 0, 2:4] = np.inf, 0.5, 0.4
+    gauge, others = solution.gauge.with_errors(error)
+    assert len(gauge.weak) == 1 and {where: len(g.weak) for where, g in others.items()} == {(0, 0): 0, (2, 0): 2}
+    parted = replace(solution, gauge=gauge, looser=others)
+    turn = mat2.exponential(0.3 * solution.gauge.directions[2:4].sum(axis=0))
+    to = solution.jones @ turn
+    apart = np.abs(parted.aligned(to).jones - to).max(axis=(1, 2, 3, 4))
+    assert apart[2] < 1e-5 and apart[0] > 0.05 and apart[1] > 0.05
 
 
 def test_errors_of_gains_without_beams():
@@ -251,7 +267,7 @@ def test_errors_are_those_of_the_inverse(now):
     wanted = np.diag(apart @ covariance @ apart).reshape(5, 2, 2, 2).mean(axis=-1)
     assert error == pytest.approx(np.sqrt(wanted), rel=1e-9)
     assert np.all(np.isinf(common[:3]))
-    if now <= 1e-9:  # else without the prior, which is known of its own directions only
+    if now <= 1e-9:  # a prior on other directions than these is not taken away
         back = np.linalg.pinv(tangents)
         assert common[3:] == pytest.approx(np.sqrt(np.diag(back @ covariance @ back.T))[3:], rel=1e-7)
 
