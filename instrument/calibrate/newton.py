@@ -22,6 +22,8 @@ STEPS = 4  # that cost as much as a new factor of it
 ROUNDING = 4 * mat2.UNIT  # of the power of the data: what sums of a sweep are wrong by along a common direction
 MOVED = 0.03  # of a matrix: errors from a normal matrix so far away are right to a percent
 EXACT = 1e-9  # of the rms of the data: what is left where there is no noise, and rounding is all there is
+EXACT_POWER = 1e-14  # of that of the data: what sums of a sweep leave of an exact fit
+STUCK = 3  # steps in a row that rounding alone has made: an end
 FLOOR = 1e-13  # of the power of the data, added to what steps along common directions cost: they are held up by 1e-5
 SLACK = 1e-12  # of the power of the data: rounding, as it sums up over sweeps
 
@@ -124,6 +126,7 @@ class _Lane:
         self.basis = BASIS[self.pattern]
         self.far, self.damping, self.fresh, self.renew, self.pays = True, 0.0, False, False, True
         self.last = self.first = np.inf  # length of the last step, and of the first with this factor
+        self.stuck = 0  # steps in a row that rounding alone has made
         self.before = np.inf  # the rate at which steps shrunk with the factor before
         self.factor: Factor | None = None
         self.own: Float = np.zeros(0)
@@ -177,7 +180,11 @@ class _Lane:
             step, gained, length, size = self._step(jones)
         # within the noise what is left over bends as much as the fit does
         self.within = gained**2 * common.freedom[k] < share * common.unknowns[k]
+        # nothing is left but rounding, and steps that only it makes: longer than the tolerance where data see little
+        still = share <= EXACT_POWER and gained <= self.lanes.settings.tolerance and length > AGAIN * self.last
+        self.stuck = self.stuck + 1 if still else 0
         self._weigh_up(length)
+        length = 0.0 if self.stuck > STUCK else length
         turned(jones, step, min(1.0, 1.0 / max(size, 1e-300)), self.seen)
         odd = self.active & (np.abs(mat2.det(jones)) <= 1e-3 * power_of(jones))
         after = np.where((odd[:, None, None]), new, self.seen)
