@@ -42,7 +42,8 @@ class Solution:
 
     `error` (t, f, A, 2, 2) is the standard error of the real part, and of the imaginary part, of every gain that noise
     makes, once `aligned` has used what is free or weak; `common_error` (t, f, n) those of the common directions
-    x_k of exp(sum_k x_k G_k), largest first, infinite where they are free. Both NaN where they are not known.
+    x_k of exp(sum_k x_k G_k), largest first, infinite where they are free (or, of
+    `SelfCal`, above ten times what holds them). Both NaN where they are not known.
     """
 
     __repr__ = short_repr

@@ -57,7 +57,10 @@ def _without_prior(common: Float, weight: float, free: Bool) -> Float:
     Where the prior has 100 times the weight of the data, or noise bends them the other way, they are infinite.
     """
     out = np.full(len(common), np.inf)
-    values, vectors = np.linalg.eigh(np.linalg.inv(common[np.ix_(~free, ~free)]) - weight * np.eye((~free).sum()))
+    if free.all():
+        return out
+    known = np.linalg.pinv(common[np.ix_(~free, ~free)], hermitian=True)
+    values, vectors = np.linalg.eigh(known - weight * np.eye(len(known)))
     least = max(0.01 * weight, 1e-300)
     variances = vectors**2 @ (1 / np.maximum(values, least))
     out[~free] = np.where(vectors**2 @ (values < least) > 0.5, np.inf, variances)

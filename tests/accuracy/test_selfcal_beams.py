@@ -10,7 +10,7 @@ from scipy.linalg import cholesky, expm
 
 import instrument
 from instrument import Chain, FeedTerm, GainTerm, Observation, Outcome, Scene, SelfCal, mat2
-from instrument.calibrate.errors import gain_errors
+from instrument.calibrate.errors import _without_prior, gain_errors
 from instrument.calibrate.factor import Factor
 from instrument.calibrate.gauge import GENERATORS
 from instrument.calibrate.lanes import Lanes
@@ -270,6 +270,15 @@ def test_errors_are_those_of_the_inverse(now):
     if now <= 1e-9:  # a prior on other directions than these is not taken away
         back = np.linalg.pinv(tangents)
         assert common[3:] == pytest.approx(np.sqrt(np.diag(back @ covariance @ back.T))[3:], rel=1e-7)
+
+
+def test_common_errors_without_their_prior():
+    """Of the covariance with it; nothing is said of what is singular, free, or known by the prior alone."""
+    data = np.array([[4.0, 1.0, 0.0], [1.0, 2.0, 0.0], [0.0, 0.0, 1e-6]])  # normal matrix of three directions
+    found = _without_prior(np.linalg.inv(data + 0.5 * np.eye(3)), 0.5, np.zeros(3, bool))
+    assert found[:2] == pytest.approx(np.diag(np.linalg.inv(data[:2, :2])), rel=1e-9) and np.isinf(found[2])
+    assert np.isinf(_without_prior(np.zeros((3, 3)), 0.5, np.array([True, False, False]))).all()
+    assert np.isinf(_without_prior(np.eye(3), 0.5, np.ones(3, bool))).all()
 
 
 def test_exponentials_are_those_of_scipy():
