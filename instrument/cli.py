@@ -60,11 +60,12 @@ def parser() -> argparse.ArgumentParser:
     both.add_argument("first", metavar="RUN", help="a run folder")
     both.add_argument("second", metavar="RUN", help="another, held against the first")
     _add_out(both, "folder to write a page compare.html into, new or empty (default: none is written)")
-    text = "Error against run time of a scene, a kind of plugin, or a plugin beside the others of its kind."
+    text = "Error against run time of a scene, a stage, a kind of plugin, or a plugin beside the others of its kind."
     verb = verbs.add_parser("precision", help=text, description=text)
-    verb.add_argument("what", metavar="WHAT", help="a scene, a kind of plugin (engines, ...), or a plugin")
+    verb.add_argument("what", metavar="WHAT", help="a scene, a stage, a kind of plugin (engines, ...), or a plugin")
     verb.add_argument("--plugins", metavar="A,B", help="of these plugins alone (default: all that can be had)")
     verb.add_argument("--quick", action="store_true", help="one value a decade, three repeats")
+    verb.add_argument("--peers", action="store_true", help="draw in other programs, those that are installed")
     _add_out(verb, "folder to write, new or empty (default: runs/precision-WHAT, or the next free name)")
     text = "Try named extreme cases with right answers: right, refused or WRONG, in digits."
     cases = verbs.add_parser("stress", help=text, description=text)
@@ -248,11 +249,11 @@ def _compare(given: argparse.Namespace) -> int:
 def _precision(given: argparse.Namespace) -> int:
     import shlex
 
-    from instrument.precision.command import precision
+    from instrument.precision.command import Form, precision
 
     plugins = [name.strip() for name in given.plugins.split(",")] if given.plugins else []
     command = shlex.join(["instrument", *given.words])
-    kept = precision(given.what, plugins, given.quick, given.out, show, given.force, command)
+    kept = precision(given.what, plugins, Form(given.quick, given.peers), given.out, show, given.force, command)
     return DONE if kept else FELL_SHORT
 
 

@@ -12,7 +12,7 @@ from instrument.jones.chain import Chain
 from instrument.jones.feed import FeedTerm
 from instrument.jones.gain import GainTerm
 from instrument.observe.observation import Observation
-from instrument.precision.contest import RIGHT, WRONG, Contest, Entry, Trial
+from instrument.precision.contest import RIGHT, WRONG, Contest, Entry, Form, Trial
 from instrument.scene import Scene
 from instrument.visibilities import Visibilities
 
@@ -22,7 +22,7 @@ SHORT = tuple(10.0**-k for k in range(2, 12))
 STEPS = 10.0  # a step of the size of the tolerance is left where a solve stops; more than ten of them is wrong
 
 
-def contests(calibrators: dict[str, Any], quick: bool) -> list[Contest]:
+def contests(calibrators: dict[str, Any], form: Form) -> list[Contest]:
     """One with errors of gains and feeds of 0.1, without noise, seen through element, tile and station beams."""
     sky = _sky()
     data = sky.corrupted(Chain(GainTerm(rms=0.1, seed=1), FeedTerm(rms=0.1, seed=2)))
@@ -42,7 +42,7 @@ def contests(calibrators: dict[str, Any], quick: bool) -> list[Contest]:
             name="calibrate through beams",
             kind="calibrators",
             knob="tolerance",
-            values=SHORT if quick else FULL,
+            values=SHORT if form.quick else FULL,
             entries=tuple(Entry(name, _answer(cls, data, sky)) for name, cls in calibrators.items()),
             judge=judge,
             error="rms of the corrected data less the model, over the rms of the model",

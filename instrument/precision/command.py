@@ -13,7 +13,7 @@ import numpy as np
 from instrument.pipeline.folder import RunFolder
 from instrument.pipeline.progress import progress_bar
 from instrument.pipeline.record import versions
-from instrument.precision.contest import OVER, REFUSED, WRONG, Contest, Row, choice, front, measured
+from instrument.precision.contest import OVER, REFUSED, WRONG, Contest, Form, Row, choice, front, measured
 from instrument.precision.contests import contests_of
 from instrument.report.page import Block, Card, Cell, Figures, Page, Section, Table, Text, duration, number, write_page
 from instrument.report.precision import precision_figure
@@ -26,7 +26,7 @@ ERRORS = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10)  # at which a choice is named
 def precision(
     what: str,
     plugins: Sequence[str] = (),
-    quick: bool = False,
+    form: Form = Form(),  # noqa: B008  a tuple
     out: str | None = None,
     show: Callable[[str], None] = print,
     force: bool = False,
@@ -34,19 +34,19 @@ def precision(
 ) -> bool:
     """Measure the contests of WHAT and write precision.ecsv, .png and .html; whether every promise was kept."""
     with RunFolder(f"precision-{os.path.basename(what).removesuffix('.toml')}", out, force) as folder:
-        contests = contests_of(what, tuple(plugins), quick)
+        contests = contests_of(what, tuple(plugins), form)
         found = []
         with progress_bar("precision") as bar:
             for k, contest in enumerate(contests):
-                rows = measured(contest, quick, lambda text, k=k: bar(k / len(contests), text))  # type: ignore[misc]
+                rows = measured(contest, form.quick, lambda text, k=k: bar(k / len(contests), text))  # type: ignore[misc]
                 found.append((contest, rows, front(rows)))
                 for text in lines(contest, rows):
                     show(text)
         every = [row for _, rows, _ in found for row in rows]
         write_ecsv(table(every, command), folder.partial / "precision.ecsv")
         entry = drawer(folder.partial)("precision", precision_figure(found), _caption(), wide=True)
-        advice = [text for contest, rows, _ in found for text in advised(contest, rows)]
-        write_page(_page(what, found, entry, advice, command, quick), folder.partial / "precision.html")
+        advice = [advised(contest, rows) for contest, rows, _ in found]
+        write_page(_page(what, found, entry, advice, command, form.quick), folder.partial / "precision.html")
         show("\n".join(advice))
         show(f"written to {folder.finish()}")
     return not any(row.outcome in (OVER, WRONG) for row in every)
@@ -80,23 +80,26 @@ def table(rows: Sequence[Row], command: str = "") -> Any:
     return made
 
 
-def advised(contest: Contest, rows: Sequence[Row]) -> list[str]:
-    """What to take at which error, in words; one line where it is the same at all."""
+def advised(contest: Contest, rows: Sequence[Row]) -> str:
+    """What to take at which error, in one line."""
     picks: dict[str, list[float]] = {}
     for error in ERRORS:
         row = choice(rows, error)
         if row is not None:
             picks.setdefault(f"{row.plugin}, {contest.knob} {row.asked:.2g} ({row.seconds:.2g} s)", []).append(error)
-    if not picks:
-        best = min((r for r in rows if np.isfinite(r.error)), key=lambda r: r.error, default=None)
-        if best is None:
-            return [f"{contest.name}: no answer from anyone"]
-        return [f"{contest.name}: least error {best.error:.2g}, by {best.plugin}, {contest.knob} {best.asked:.2g}"]
-    return [
-        f"{contest.name}: for an error of {' to '.join(dict.fromkeys(f'{e:.0e}' for e in (errors[0], errors[-1])))} "
-        f"take {pick}"
-        for pick, errors in picks.items()
-    ]
+    if picks:
+        ways = (
+            f"for an error of {' to '.join(dict.fromkeys(f'{e:.0e}' for e in (errors[0], errors[-1])))} take {pick}"
+            for pick, errors in picks.items()
+        )
+        return f"{contest.name}: {'; '.join(ways)}"
+    best = min((r for r in rows if np.isfinite(r.error)), key=lambda r: r.error, default=None)
+    if best is None:
+        return f"{contest.name}: no answer from anyone"
+    return (
+        f"{contest.name}: nobody comes below {ERRORS[0]:g}; least error {best.error:.2g}, by {best.plugin}, "
+        f"{contest.knob} {best.asked:.2g} ({best.seconds:.2g} s)"
+    )
 
 
 def _caption() -> str:

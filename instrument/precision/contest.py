@@ -20,6 +20,13 @@ LONG = 20.0  # seconds of one trial that are not repeated beyond the fewest
 RIGHT, REFUSED, OVER, WRONG = "right", "refused", "over the tolerance", "said converged, was wrong"
 
 
+class Form(NamedTuple):
+    """How wide a contest is: `quick` takes fewer values and repeats, `peers` draws other programs in."""
+
+    quick: bool = False
+    peers: bool = False
+
+
 class Trial(NamedTuple):
     """What an answer is worth: its error, that in the user's quantity, and how it ended, in words."""
 

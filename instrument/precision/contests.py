@@ -7,38 +7,49 @@ from typing import Any
 
 from instrument.errors import InputError, did_you_mean
 from instrument.precision import calibrators, engines, foregrounds
-from instrument.precision.contest import Contest
+from instrument.precision.contest import Contest, Form
 from instrument.registry import available
 
-# kind of plugin -> its contests, of plugins by name; `quick` takes fewer values
-OF_KIND: dict[str, Callable[[dict[str, Any], bool], list[Contest]]] = {
+FULL = Form()
+
+# kind of plugin -> its contests, of plugins by name
+OF_KIND: dict[str, Callable[[dict[str, Any], Form], list[Contest]]] = {
     "engines": engines.contests,
     "calibrators": calibrators.contests,
     "foregrounds": foregrounds.contests,
 }
+# what is no plugin -> its contests
+OF_STAGE: dict[str, Callable[[Form], list[Contest]]] = {}
 
 
-def contests_of(what: str, plugins: tuple[str, ...] = (), quick: bool = False) -> list[Contest]:
-    """The contests of WHAT: a scene, a kind of plugin, or a plugin, which then stands beside all others of its kind.
+def contests_of(what: str, plugins: tuple[str, ...] = (), form: Form = FULL) -> list[Contest]:
+    """The contests of WHAT: a scene, a stage, a kind of plugin, or a plugin, beside all others of its kind.
 
     With `plugins` of these alone. Raises `InputError` where WHAT is nothing, two things, or has no contest yet.
     """
     from instrument.pipeline.scene_text import shipped
 
+    found = [f"a {word}" for word, names in (("stage", OF_STAGE), ("kind of plugin", OF_KIND)) if what in names]
     kinds = [what] if what in OF_KIND else [kind for kind in OF_KIND if what in available(kind)]
-    is_scene = what.endswith(".toml") or what in shipped()
-    if is_scene and kinds:
-        raise InputError(f"'{what}' is a scene, and {kinds[0]}: write it as {what}.toml, or name a kind")
-    if len(kinds) > 1:
-        raise InputError(f"'{what}' is found in {' and '.join(kinds)}: name a kind, with --plugins {what}")
-    if is_scene:
-        return engines.contests_of_scene(what, _chosen("engines", plugins), quick)
-    if not kinds:
-        known = [*shipped(), *OF_KIND, *(name for kind in OF_KIND for name in available(kind))]
+    if what not in OF_KIND:
+        found += [f"one of {kind}" for kind in kinds]
+    if what.endswith(".toml") or what in shipped():
+        found.insert(0, "a scene")
+    if len(found) > 1:
+        way = f"write it as {what}.toml, or name a kind" if "a scene" in found else f"name a kind, with --plugins {what}"
+        raise InputError(f"'{what}' is {' and '.join(found)}: {way}")
+    if not found:
+        known = [*shipped(), *OF_STAGE, *OF_KIND, *(name for kind in OF_KIND for name in available(kind))]
         raise InputError(
-            f"no scene, kind of plugin or plugin with a contest is called '{what}': {did_you_mean(what, known)}"
+            f"no scene, stage, kind of plugin or plugin with a contest is called '{what}': {did_you_mean(what, known)}"
         )
-    return OF_KIND[kinds[0]](_chosen(kinds[0], plugins), quick)
+    if what in OF_STAGE:
+        if plugins:
+            raise InputError(f"--plugins {','.join(plugins)}: the contest of {what} is of settings, leave it out")
+        return OF_STAGE[what](form)
+    if kinds:
+        return OF_KIND[kinds[0]](_chosen(kinds[0], plugins), form)
+    return engines.contests_of_scene(what, _chosen("engines", plugins), form)
 
 
 def _chosen(kind: str, names: tuple[str, ...]) -> dict[str, Any]:

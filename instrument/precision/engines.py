@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from instrument.errors import InputError, RefusedError
-from instrument.precision.contest import Contest, Entry, Trial
+from instrument.precision.contest import Contest, Entry, Form, Trial
 from instrument.precision.truth import visibilities
 from instrument.scene import Scene
 from instrument.units import Complex
@@ -17,12 +17,12 @@ FULL = tuple(10.0 ** (-k / 8) for k in range(16, 97))  # eight a decade, 1e-2 to
 SHORT = tuple(10.0**-k for k in range(2, 13))
 
 
-def contests(engines: dict[str, Any], quick: bool) -> list[Contest]:
+def contests(engines: dict[str, Any], form: Form) -> list[Contest]:
     """One a scene that is shipped and has a list of sources as its sky: here the grid of the mock observation."""
-    return contests_of_scene("mock-grid", engines, quick)
+    return contests_of_scene("mock-grid", engines, form)
 
 
-def contests_of_scene(name: str, engines: dict[str, Any], quick: bool) -> list[Contest]:
+def contests_of_scene(name: str, engines: dict[str, Any], form: Form) -> list[Contest]:
     """The contest on the first stations, the middle times and the first channels of a scene."""
     from instrument.pipeline.scene_file import parse
     from instrument.pipeline.scene_text import read_tables
@@ -46,7 +46,7 @@ def contests_of_scene(name: str, engines: dict[str, Any], quick: bool) -> list[C
             name=f"predict {name}",
             kind="engines",
             knob="tolerance",
-            values=SHORT if quick else FULL,
+            values=SHORT if form.quick else FULL,
             entries=entries,
             judge=judge,
             error=f"largest error of a visibility of {len(chosen)} of {full.shape[2]} baselines, over the total flux",

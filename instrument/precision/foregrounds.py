@@ -12,7 +12,7 @@ from instrument.errors import InstrumentWarning
 from instrument.foreground.loss import signal_loss
 from instrument.image.cube import StokesCube
 from instrument.image.mocks import FINE, leaked, noise_cube, polarized_screens
-from instrument.precision.contest import Contest, Entry, Trial
+from instrument.precision.contest import Contest, Entry, Form, Trial
 
 PIXELS = (48, 96)  # of the quick form and of the full one
 LEAKED, NOISE = 7.1e-3, 10e-3  # K, rms of a voxel in Stokes I
@@ -25,11 +25,11 @@ KNOBS = {  # field of a remover -> its values; the first that a remover has is i
 SCREENS = FINE.with_fields(width=0.5, floor=0.05, slope=3.5, uv_range=(10.0, 800.0))
 
 
-def contests(removers: dict[str, Any], quick: bool) -> list[Contest]:
+def contests(removers: dict[str, Any], form: Form) -> list[Contest]:
     """One: Faraday screens that leak into I, 7.1 mK, under noise of 10 mK, 161 channels from 134 to 166 MHz."""
     from astropy import units as u
 
-    pixels = PIXELS[0] if quick else PIXELS[1]
+    pixels = PIXELS[0] if form.quick else PIXELS[1]
     screens = leaked(polarized_screens(pixels=pixels, pixel=0.5 * u.arcmin, screens=SCREENS, seed=196))
     data = np.array(screens.data)
     data[:, 0] *= np.float32(LEAKED / screens.data[:, 0].std())
@@ -54,7 +54,7 @@ def contests(removers: dict[str, Any], quick: bool) -> list[Contest]:
             kind="foregrounds",
             knob="own setting",
             values=(0.0,),
-            entries=tuple(_entry(name, cls, cube, quick) for name, cls in removers.items()),
+            entries=tuple(_entry(name, cls, cube, form.quick) for name, cls in removers.items()),
             judge=judge,
             error="power of what the removal got wrong over that of the foreground (1: nothing gained)",
             error_user="21-cm signal lost, 0.06 < k_par < 1 and 0.02 < k_perp < 0.5 1/Mpc",

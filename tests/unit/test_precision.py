@@ -11,7 +11,7 @@ import instrument.precision.command as command
 from instrument import InputError
 from instrument.cli import main
 from instrument.errors import RefusedError
-from instrument.precision import Contest, Entry, Row, Trial, contests_of
+from instrument.precision import Contest, Entry, Form, Row, Trial, contests_of
 from instrument.precision.contest import OVER, WRONG, choice, front, measured
 from instrument.precision.engines import SHORT
 
@@ -100,7 +100,7 @@ def test_a_broken_promise_is_status_3(tmp_path, monkeypatch, word):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["nothing"], "no scene, kind of plugin or plugin with a contest is called 'nothing'"),
+        (["nothing"], "no scene, stage, kind of plugin or plugin with a contest is called 'nothing'"),
         (["enginse"], "'engines'"),
         (["engines", "--plugins", "matrixx"], "no engine is called 'matrixx'"),
     ],
@@ -119,7 +119,7 @@ def test_contests_are_of_plugins_that_can_be_had():
 
 @pytest.mark.long
 def test_engines_keep_their_tolerance_against_extended_precision():
-    (one,) = contests_of("engines", quick=True)
+    (one,) = contests_of("engines", form=Form(quick=True))
     for entry in one.entries:
         for asked in SHORT[:8]:
             assert one.judge(entry.answer(asked), asked).error <= asked
@@ -127,7 +127,7 @@ def test_engines_keep_their_tolerance_against_extended_precision():
 
 @pytest.mark.long
 def test_solvers_that_say_converged_are_right():
-    (one,) = contests_of("calibrators", quick=True)
+    (one,) = contests_of("calibrators", form=Form(quick=True))
     for entry in one.entries:
         for asked in one.values:
             assert one.judge(entry.answer(asked), asked).outcome == "right"
