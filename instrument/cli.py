@@ -249,6 +249,10 @@ def _compare(given: argparse.Namespace) -> int:
 def _precision(given: argparse.Namespace) -> int:
     import shlex
 
+    if given.peers:
+        from instrument.threads import one_thread
+
+        one_thread()
     from instrument.precision.command import Form, precision
 
     plugins = [name.strip() for name in given.plugins.split(",")] if given.plugins else []

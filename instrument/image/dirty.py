@@ -32,7 +32,8 @@ class Imager(AnyImager):
     """Dirty images of `pixels` x `pixels` of `pixel` each, from baselines within `uv_range` (wavelengths).
 
     `weighting` "natural", "uniform" or "briggs" (with `robust`). The w-term is always there. `accuracy` is that of the
-    gridding, of the worst pixel relative to the rms of the image. Flagged and non-finite visibilities have no weight.
+    gridding: the error of every pixel is below it times the weighted mean of |V|, which no pixel of an image exceeds.
+    Flagged and non-finite visibilities have no weight.
     Where correlations have weights or flags of their own, so have I, Q, U and V (`stokes_weight`); the PSF is then that
     of Stokes I.
     """
@@ -80,7 +81,7 @@ class Imager(AnyImager):
 
     def error(self) -> str:
         """That of the gridding."""
-        return f"gridding {self.accuracy:.0e} of the image rms"
+        return f"gridding {self.accuracy:.0e} of the mean |V|"
 
 
 class _Channel:
@@ -161,7 +162,8 @@ class Images(ImageSums):
                 npix_y=self.imager.pixels,
                 pixsize_x=self.imager.pixel,
                 pixsize_y=self.imager.pixel,
-                # half of it: ducc0's is an rms, and the largest error, at the edge, was up to 1.5 times that asked for
+                # half of it: ducc0's is an rms, and the largest error, at the edge, was up to 1.5 times that asked for.
+                # One visibility is then wrong by 0.52 times the accuracy at most, and errors add up at worst
                 epsilon=max(self.imager.accuracy / 2, 1e-12),
                 do_wgridding=True,
                 divide_by_n=False,

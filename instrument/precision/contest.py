@@ -6,6 +6,7 @@ import gc
 import time
 import tracemalloc
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -18,6 +19,7 @@ QUICK = 3
 SPREAD = 0.05  # of the median: the half width of its 95 % interval at which the full form is content
 LONG = 20.0  # seconds of one trial that are not repeated beyond the fewest
 RIGHT, REFUSED, OVER, WRONG = "right", "refused", "over the tolerance", "said converged, was wrong"
+UNSET = float("nan")  # asked of an entry that has no such knob
 
 
 class Form(NamedTuple):
@@ -28,20 +30,22 @@ class Form(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """What an answer is worth: its error, that in the user's quantity, and how it ended, in words."""
+    """What an answer is worth: its error, that in the user's quantity (rms, largest), and how it ended, in words."""
 
     error: float
     error_user: float
     outcome: str = RIGHT
+    user_max: float = np.nan
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A contestant: the name of a plugin, and its answer to a value of the knob."""
+    """A contestant: the name of a plugin, and its answer to a value of the knob; what a `peer` promises is its own."""
 
     plugin: str
     answer: Callable[[float], Any]
     values: tuple[float, ...] = ()  # of a knob of its own, instead of those of the contest
+    peer: bool = False
 
 
 @dataclass(frozen=True)
@@ -49,7 +53,8 @@ class Contest:
     """One job: a `knob` with `values`, entries, and a judge from an answer and what was asked to a `Trial`.
 
     `error`, `error_user` and `truth` say in words what is measured and against what. With `honoured` the knob is an
-    error that was promised: one above it is a fault.
+    error that was promised: one above it is a fault. Contests of one `family` are the same job at another `size`.
+    `peers` are the packages of other programs that may stand here, installed or not.
     """
 
     name: str
@@ -62,10 +67,18 @@ class Contest:
     error_user: str
     truth: str
     honoured: bool = False
+    family: str = ""
+    size: float = np.nan
+    size_word: str = ""
+    peers: tuple[str, ...] = ()
 
 
 class Row(NamedTuple):
-    """One line of the table: seconds of wall time (median), their spread relative to it, bytes that Python knows of."""
+    """One answer: seconds of wall time (median), their spread relative to it, bytes that Python knows of.
+
+    What stands behind `outcome` is in no column of the table: the largest error in the user's quantity, seconds of the
+    first answer in this process, those in which loops were compiled or read from their cache meanwhile, the repeats.
+    """
 
     contest: str
     plugin: str
@@ -77,6 +90,14 @@ class Row(NamedTuple):
     seconds_spread: float
     peak_bytes: float
     outcome: str
+    user_max: float = np.nan
+    first: float = np.nan
+    compiled: float = np.nan
+    repeats: int = 0
+    peer: bool = False
+
+
+COLUMNS = Row._fields[: Row._fields.index("outcome") + 1]
 
 
 class _Case:
@@ -85,21 +106,34 @@ class _Case:
     def __init__(self, contest: Contest, entry: Entry, asked: float) -> None:
         self.contest, self.entry, self.asked = contest, entry, asked
         self.seconds: list[float] = []
-        self.peak = np.nan
+        self.peak = self.first = self.compiled = np.nan
         try:
-            tracemalloc.start()
-            try:
-                found = entry.answer(asked)
-                self.peak = float(tracemalloc.get_traced_memory()[1])
-            finally:
-                tracemalloc.stop()
-            self.trial = contest.judge(found, asked)
+            self.trial = contest.judge(self._answer(), asked)
+            self.peak = self._peak()
         except (RefusedError, InputError) as error:
             self.trial = Trial(np.nan, np.nan, f"{REFUSED}: {error}")
         except Exception as error:  # a stranger's plugin may fail in any way, and stays in the table
             self.trial = Trial(np.nan, np.nan, f"failed: {type(error).__name__}: {error}")
-        if contest.honoured and self.trial.error > asked and self.trial.outcome == RIGHT:
+        if contest.honoured and not entry.peer and self.trial.error > asked and self.trial.outcome == RIGHT:
             self.trial = self.trial._replace(outcome=OVER)
+
+    def _answer(self) -> Any:
+        """The first answer, and its seconds."""
+        with _compiling() as spent:
+            start = time.perf_counter()
+            found = self.entry.answer(self.asked)
+            self.first = time.perf_counter() - start
+        self.compiled = sum(spent)
+        return found
+
+    def _peak(self) -> float:
+        """Most bytes that Python knows of, in a run of its own."""
+        tracemalloc.start()
+        try:
+            self.entry.answer(self.asked)
+            return float(tracemalloc.get_traced_memory()[1])
+        finally:
+            tracemalloc.stop()
 
     @property
     def runs(self) -> bool:
@@ -139,8 +173,19 @@ class _Case:
         seconds = float(np.median(self.seconds)) if self.seconds else np.nan
         return Row(
             *(contest.name, self.entry.plugin, contest.knob, self.asked, trial.error, trial.error_user),
-            *(seconds, self.spread, self.peak, trial.outcome),
+            *(seconds, self.spread, self.peak, trial.outcome, trial.user_max),
+            *(self.first, self.compiled, len(self.seconds), self.entry.peer),
         )
+
+
+@contextmanager
+def _compiling() -> Iterator[list[float]]:
+    """Seconds in which loops are compiled, or read from where they are kept, as a list once it has ended."""
+    from numba.core import event
+
+    spent: list[float] = []
+    with event.install_timer("numba:compiler_lock", spent.append):
+        yield spent
 
 
 def measured(contest: Contest, quick: bool = False, said: Callable[[str], None] = lambda text: None) -> list[Row]:
@@ -150,11 +195,15 @@ def measured(contest: Contest, quick: bool = False, said: Callable[[str], None] 
         for asked in entry.values or contest.values:
             said(f"{contest.name}: {entry.plugin}, {contest.knob} {asked:g}")
             cases.append(_Case(contest, entry, asked))
-    for number, due in enumerate(_rounds(cases, quick)):
-        said(f"{contest.name}: round {number + 1}, {len(due)} times to take")
-        for case in due:
-            gc.collect()
-            case.run()
+    gc.freeze()  # what is there stays there: a collection before each time then takes 1 ms, not 200
+    try:
+        for number, due in enumerate(_rounds(cases, quick)):
+            said(f"{contest.name}: round {number + 1}, {len(due)} times to take")
+            for case in due:
+                gc.collect()
+                case.run()
+    finally:
+        gc.unfreeze()
     return [case.row() for case in cases]
 
 
@@ -175,5 +224,4 @@ def front(rows: Sequence[Row]) -> list[Row]:
 
 def choice(rows: Sequence[Row], error: float) -> Row | None:
     """The quickest of some rows whose error is at most so much."""
-    good = [r for r in front(rows) if r.error <= error]
-    return good[0] if good else None
+    return next((row for row in front(rows) if row.error <= error), None)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from instrument.errors import InputError, did_you_mean
-from instrument.precision import calibrators, engines, foregrounds
+from instrument.precision import calibrators, engines, faraday, foregrounds, imagers, photometry, spectra
 from instrument.precision.contest import Contest, Form
 from instrument.registry import available
 
@@ -16,10 +16,24 @@ FULL = Form()
 OF_KIND: dict[str, Callable[[dict[str, Any], Form], list[Contest]]] = {
     "engines": engines.contests,
     "calibrators": calibrators.contests,
+    "imagers": imagers.contests,
     "foregrounds": foregrounds.contests,
 }
 # what is no plugin -> its contests
-OF_STAGE: dict[str, Callable[[Form], list[Contest]]] = {}
+OF_STAGE: dict[str, Callable[[Form], list[Contest]]] = {
+    "photometry": photometry.contests,
+    "rm-synthesis": faraday.synthesis,
+    "rm-clean": faraday.clean,
+    "spectra": spectra.contests,
+}
+# a table of a scene file -> what of the above it holds
+HOLDS = {
+    "predict": ("engines",),
+    "calibrate": ("calibrators",),
+    "image": ("imagers",),
+    "analyze": (*OF_STAGE, "foregrounds"),
+    "all": (*OF_KIND, *OF_STAGE),
+}
 
 
 def contests_of(what: str, plugins: tuple[str, ...] = (), form: Form = FULL) -> list[Contest]:
@@ -29,20 +43,25 @@ def contests_of(what: str, plugins: tuple[str, ...] = (), form: Form = FULL) -> 
     """
     from instrument.pipeline.scene_text import shipped
 
-    found = [f"a {word}" for word, names in (("stage", OF_STAGE), ("kind of plugin", OF_KIND)) if what in names]
+    stages = (*OF_STAGE, *HOLDS)
+    found = [f"a {word}" for word, names in (("stage", stages), ("kind of plugin", OF_KIND)) if what in names]
     kinds = [what] if what in OF_KIND else [kind for kind in OF_KIND if what in available(kind)]
     if what not in OF_KIND:
         found += [f"one of {kind}" for kind in kinds]
     if what.endswith(".toml") or what in shipped():
         found.insert(0, "a scene")
     if len(found) > 1:
-        way = f"write it as {what}.toml, or name a kind" if "a scene" in found else f"name a kind, with --plugins {what}"
-        raise InputError(f"'{what}' is {' and '.join(found)}: {way}")
+        way = f"write it as {what}.toml, or" if "a scene" in found else f"with --plugins {what},"
+        raise InputError(f"'{what}' is {' and '.join(found)}: {way} name a kind")
     if not found:
-        known = [*shipped(), *OF_STAGE, *OF_KIND, *(name for kind in OF_KIND for name in available(kind))]
+        known = [*shipped(), *stages, *OF_KIND, *(name for kind in OF_KIND for name in available(kind))]
         raise InputError(
             f"no scene, stage, kind of plugin or plugin with a contest is called '{what}': {did_you_mean(what, known)}"
         )
+    if what in HOLDS:
+        if plugins and len(HOLDS[what]) > 1:
+            raise InputError(f"--plugins {','.join(plugins)}: {what} is {', '.join(HOLDS[what])}; name one of them")
+        return [contest for part in HOLDS[what] for contest in contests_of(part, plugins, form)]
     if what in OF_STAGE:
         if plugins:
             raise InputError(f"--plugins {','.join(plugins)}: the contest of {what} is of settings, leave it out")

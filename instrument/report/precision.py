@@ -31,6 +31,21 @@ def precision_figure(contests: Sequence[tuple[Any, Sequence[Any], Sequence[Any]]
     return figure
 
 
+@styled
+def overview_figure(contests: Sequence[tuple[Any, Sequence[Any], Sequence[Any]]]) -> Figure:
+    """Error against seconds of many contests, given as for `precision_figure`, three in a row."""
+    lines = -(-len(contests) // 3)
+    figure = Figure(figsize=(17, 5.6 * lines), layout="constrained")
+    panels = figure.subplots(lines, 3, squeeze=False).ravel()
+    for ax, (contest, rows, front) in zip(panels, contests, strict=False):
+        _against_seconds(ax, contest, rows, front, "error")
+        ax.set_title(contest.name, loc="left", fontweight="bold")
+        ax.legend(loc="best", fontsize=9, frameon=False)
+    for ax in panels[len(contests) :]:
+        ax.set_axis_off()
+    return figure
+
+
 def _series(rows: Sequence[Any]) -> list[tuple[str, str, str, list[Any]]]:
     """Name, colour, mark and rows of each contestant."""
     names = list(dict.fromkeys(row.plugin for row in rows))
@@ -46,10 +61,13 @@ def _against_seconds(ax: Axes, contest: Any, rows: Sequence[Any], front: Sequenc
         good = [row for row in own if np.isfinite(row.seconds) and getattr(row, which) > 0]
         if good:
             x, y = ([getattr(row, key) for row in good] for key in ("seconds", which))
-            ax.plot(x, y, color=colour, marker=mark, ms=6, lw=1.2, label=name, alpha=0.9)
-            for row in (good[0], good[-1])[: 2 if len(good) > 1 else 1]:
+            style: dict[str, Any] = {"mfc": "none", "ls": "--"} if good[0].peer else {}
+            ax.plot(x, y, color=colour, marker=mark, ms=6, lw=1.2, label=name, alpha=0.9, **style)
+            if which == "error_user":
+                ax.vlines(x, y, [max(row.error_user, row.user_max) for row in good], color=colour, lw=0.8, alpha=0.5)
+            for row in (good[0], good[-1])[: (2 if len(good) > 1 else 1) if np.isfinite(good[0].asked) else 0]:
                 where = (row.seconds, getattr(row, which))
-                ax.annotate(f"{row.asked:.2g}", where, xytext=(5, 4), textcoords="offset points", fontsize=9, color=INK)
+                ax.annotate(f"{row.asked:.3g}", where, xytext=(5, 4), textcoords="offset points", fontsize=9, color=INK)
         lost = sum(not np.isfinite(row.seconds) for row in own)
         if lost:  # failures stay in: at the edge, with their count
             place = 0.95 - 0.06 * list(dict.fromkeys(row.plugin for row in rows)).index(name)
@@ -63,10 +81,11 @@ def _against_seconds(ax: Axes, contest: Any, rows: Sequence[Any], front: Sequenc
 
 
 def _asked_and_got(ax: Axes, contest: Any, rows: Sequence[Any]) -> None:
-    """What was asked against what came; on own settings, that are no errors, the axis of what was asked is linear."""
-    promised = contest.knob == "tolerance"
+    """What was asked against what came; settings that are no errors have no line of what is right."""
+    promised = contest.honoured
     ax.set(yscale="log", xlabel=contest.knob, ylabel="error that came")
-    if promised:
+    asked = [row.asked for row in rows if row.asked > 0]
+    if promised or (asked and max(asked) > 30 * min(asked)):
         ax.set_xscale("log")
     for k, (_, colour, mark, own) in enumerate(_series(rows)):
         good = [row for row in own if row.error > 0]

@@ -22,7 +22,7 @@ HEAVY = {"astropy", "scipy", "numba", "matplotlib", "ducc0", "h5py", "jinja2", "
 # stands for a module or for a whole package.
 LAYERS = (
     ("errors", "data", "scenes"),
-    ("numbers", "compiled", "terminal", "provenance"),
+    ("numbers", "compiled", "terminal", "threads", "provenance"),
     ("shown",),
     ("whole_file",),
     ("units", "checked"),

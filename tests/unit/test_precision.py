@@ -11,8 +11,8 @@ import instrument.precision.command as command
 from instrument import InputError
 from instrument.cli import main
 from instrument.errors import RefusedError
-from instrument.precision import Contest, Entry, Form, Row, Trial, contests_of
-from instrument.precision.contest import OVER, WRONG, choice, front, measured
+from instrument.precision import Contest, Entry, Form, Trial, contests_of
+from instrument.precision.contest import COLUMNS, OVER, WRONG, choice, front, measured
 from instrument.precision.engines import SHORT
 
 
@@ -80,7 +80,7 @@ def test_a_table_a_figure_and_a_page_are_written(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(command, "contests_of", lambda *given: [contest(good=good, slow=slow, picky=picky)])
     assert main(["precision", "engines", "--quick", "--out", str(tmp_path / "p")]) == 0
     table = QTable.read(tmp_path / "p" / "precision.ecsv")
-    assert table.colnames == list(Row._fields) and len(table) == 6 and table.meta["versions"]["numpy"]
+    assert table.colnames == list(COLUMNS) and len(table) == 6 and table.meta["versions"]["numpy"]
     assert (tmp_path / "p" / "precision.png").stat().st_size > 10000
     page = (tmp_path / "p" / "precision.html").read_text()
     assert "instrument precision engines --quick" in page and "its bound is 1e-3: the floor" in page

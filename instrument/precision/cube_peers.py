@@ -1,0 +1,199 @@
+"""Programs of others beside what is made of cubes: ducc0 alone, RM-Tools, rm-lite, ps_eor; those that are installed.
+
+Each is called in this process as its users call it, its messages left out. What is asked of them is theirs, so that a
+promise they break is no fault of this package.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from instrument.image.cube import StokesCube
+from instrument.observe.directions import LIGHT
+from instrument.precision.contest import RIGHT, UNSET, Entry
+from instrument.units import Float
+from instrument.visibilities import Visibilities
+
+IMAGERS, FARADAY, SPECTRA = ("ducc0",), ("rm-tools", "rm-lite"), ("ps_eor",)
+ACCURACIES = tuple(10.0**-k for k in range(3, 13))
+WINDOWS = {None: "boxcar", "hann": "hann", "blackman-harris": "blackmanharris"}  # ours: those of ps_eor
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Without what they print, log and warn of."""
+    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+        warnings.simplefilter("ignore")
+        before = logging.root.manager.disable
+        logging.disable(logging.ERROR)
+        try:
+            yield
+        finally:
+            logging.disable(before)
+
+
+def _entry(name: str, answer: Callable[[float], Any], values: Sequence[float] = ()) -> Entry:
+    def silent(asked: float) -> Any:
+        with quiet():
+            return answer(asked)
+
+    return Entry(name, silent, tuple(values), peer=True)
+
+
+# Images -----------------------------------------------------------------------------------------------------------
+
+
+def imager_peers(data: Visibilities, pixels: int, pixel: float, values: Sequence[float]) -> list[Entry]:
+    """ducc0 alone: one call for each Stokes parameter that is not zero, with natural weights."""
+    from ducc0.wgridder.experimental import vis2dirty
+
+    def answer(asked: float) -> Float:
+        freq = data.freq_hz[:1]
+        uvw = np.ascontiguousarray(data.uvw_m.reshape(-1, 3))
+        weight = np.ascontiguousarray(np.broadcast_to(data.whole_weight, data.data.shape[:3])[:, 0].reshape(-1, 1))
+        planes = np.zeros((4, pixels, pixels))
+        for plane, values in zip(planes, np.moveaxis(data.stokes()[:, 0], -1, 0), strict=True):
+            vis = np.ascontiguousarray(values.reshape(-1, 1))
+            if vis.any():
+                plane[:] = vis2dirty(
+                    uvw=uvw, freq=freq, vis=vis, wgt=weight, npix_x=pixels, npix_y=pixels, pixsize_x=pixel,
+                    pixsize_y=pixel, epsilon=asked, do_wgridding=True, divide_by_n=False, flip_u=True, flip_w=True,
+                    nthreads=0,
+                ).T  # fmt: skip
+        return np.asarray(planes / weight.sum())
+
+    return [_entry("ducc0 alone (epsilon)", answer, [v for v in values if v >= 1e-12])]
+
+
+# Faraday depth ----------------------------------------------------------------------------------------------------
+
+
+def synthesis_peers(cube: StokesCube, depths: Float) -> list[Entry]:
+    """RM-Tools by the accuracy of its transforms, in the precision that has it; rm-lite the same."""
+    q, v = (np.ascontiguousarray(cube.data[:, k]) for k in (1, 2))
+    lambda2 = (LIGHT / cube.freq_hz) ** 2
+    found = []
+    if find_spec("RMutils"):
+        from RMutils.util_RM import do_rmsynth_planes
+
+        def tools(asked: float) -> Any:
+            bits = 32 if asked >= 1e-7 else 64
+            return do_rmsynth_planes(q, v, lambda2, depths, nBits=bits, eps=asked, log=_nothing).FDFcube
+
+        found.append(_entry("RM-Tools (eps)", tools, ACCURACIES))
+    if find_spec("rm_lite"):
+        found.append(_entry("rm-lite (eps)", _rm_lite_synthesis(q, v, lambda2, depths), ACCURACIES))
+    return found
+
+
+def _rm_lite_synthesis(q: Float, v: Float, lambda2: Float, depths: Float) -> Callable[[float], Any]:
+    from rm_lite.utils.synthesis import rmsynth_nufft
+
+    def answer(asked: float) -> Any:
+        return rmsynth_nufft(q + 1j * v, lambda2, depths, np.ones(len(lambda2)), float(lambda2.mean()), eps=asked)
+
+    return answer
+
+
+def clean_peers(dirty: Any, gain: float) -> list[Entry]:
+    """RM-Tools and rm-lite by the cutoff, on the same dirty spectra."""
+    found = []
+    step = dirty.depths[1] - dirty.depths[0]
+    wide = step * np.arange(1 - len(dirty.depths), len(dirty.depths))
+    shape = dirty.data.shape[1:]
+    rmsf = np.repeat(dirty.rmsf_at(wide)[:, None], np.prod(shape), axis=1).reshape(len(wide), *shape)
+    if find_spec("RMutils"):
+        from RMutils.util_RM import do_rmclean_hogbom
+
+        def tools(asked: float) -> Any:
+            fwhm = np.full(shape, dirty.fwhm)
+            made = do_rmclean_hogbom(
+                dirty.data, dirty.depths, rmsf, wide, fwhm, asked, 100_000, gain, nBits=64, window=asked, log=_nothing
+            )
+            return made.ccArr, RIGHT
+
+        found.append(_entry("RM-Tools (cutoff)", tools, tuple(10.0**-k for k in (1, 2, 3))))
+    return found
+
+
+def _nothing(*text: Any, **more: Any) -> None:
+    """RM-Tools prints by default."""
+
+
+# Power spectra ----------------------------------------------------------------------------------------------------
+
+
+def _ps_eor(field: Float, freq: Float, pixel: float, taper: Any, space: Any = None) -> tuple[Any, Any]:
+    """Its cube of (u, v) cells of a field (F, Ny, Nx), and its maker of spectra, as many delays as channels."""
+    from ps_eor import datacube, pspec
+
+    about = datacube.ImageMetaData.from_res(pixel, field.shape[1:])
+    about.wcs.wcs.cdelt[2] = freq[1] - freq[0]
+    images = datacube.CartImageCube(field, freq, about)
+    if space:
+        images.apply_window_function(datacube.WindowFunction(WINDOWS[space], circular=False))
+    longest = 0.5 / pixel
+    cells = images.ft(0, longest)
+    settings = pspec.PowerSpectraConfig(el=2 * np.pi * np.geomspace(1 / (pixel * field.shape[1]), longest, 12))
+    settings.window_fct, settings.umin, settings.umax = WINDOWS[taper], 0, longest
+    band = pspec.EorBin(0, freq, freq, M=len(freq))
+    return cells, pspec.PowerSpectraCart(band, settings, datacube.NoPrimaryBeam())
+
+
+def floor_peers(cube: StokesCube) -> list[Entry]:
+    """ps_eor by its tapers: the mean power of every delay that it gives."""
+    if not find_spec("ps_eor"):
+        return []
+    return [_entry(f"ps_eor {WINDOWS[name]}", _levels(cube, name)) for name in WINDOWS]
+
+
+def _levels(cube: StokesCube, taper: Any) -> Callable[[float], Any]:
+    from astropy.cosmology import Planck15
+
+    h = Planck15.h
+
+    def answer(asked: float) -> Any:
+        cells, made = _ps_eor(np.array(cube.data[:, 0]), cube.freq_hz, cube.pixel_rad, taper)
+        return made.k_par * h, np.nanmean(made.get_ps2d(cells).data, axis=1) / h**3
+
+    return answer
+
+
+def known_peers(cubes: Sequence[StokesCube], edges: Float, law: Callable[[Float], Float]) -> list[Entry]:
+    """ps_eor with the tapers of ours that it has; its bandwidth (N - 1) dnu is taken as it is."""
+    if not find_spec("ps_eor"):
+        return []
+    pairs = ((None, None), ("hann", None), ("blackman-harris", None), ("blackman-harris", "hann"), ("hann", "hann"))
+    return [
+        _entry(f"ps_eor {WINDOWS[a]}, images {b or 'none'}", _known(cubes, edges, law, a, b), (UNSET,))
+        for a, b in pairs
+    ]
+
+
+def _known(cubes: Sequence[StokesCube], edges: Float, law: Any, taper: Any, space: Any) -> Callable[[float], Float]:
+    from astropy.cosmology import Planck15
+    from ps_eor import psutil
+
+    h = Planck15.h
+
+    def answer(asked: float) -> Float:
+        out = []
+        for cube in cubes:
+            cells, made = _ps_eor(np.array(cube.data[:, 0]), cube.freq_hz, cube.pixel_rad, taper, space)
+            ball = made.get_ps3d(edges / h, cells)
+            perp, par = psutil.l_to_k(2 * np.pi * cells.ru, made.z) * h, made.k_par * h
+            k = np.hypot(perp, par[:, None])
+            index = np.digitize(k, edges) - 1
+            due = np.array([law(k[index == i]).mean() for i in range(len(edges) - 1)])
+            out.append(ball.data * 2 * np.pi**2 / (ball.k_mean * h) ** 3 / due)
+        return np.array(out)
+
+    return answer
