@@ -1,6 +1,5 @@
 """What the reports beside DP3 share: its environment, the maker of Measurement Sets, timing of whole processes."""
 
-import importlib.util
 import os
 import re
 import subprocess
@@ -20,11 +19,9 @@ def peer_tools(folder):
     (folder / "casarc").write_text(f"measures.directory: {Path(casacore.__file__).parent / 'data'}\n")
     os.environ["CASARCFILES"] = str(folder / "casarc")
     os.environ["EVERYBEAM_DATADIR"] = everybeam_data()
-    where = Path(__file__).parents[2] / "tests" / "peers" / "lofar_ms.py"
-    spec = importlib.util.spec_from_file_location("lofar_ms", where)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    from instrument.precision import lofar_ms
+
+    return lofar_ms
 
 
 def process(command, environment):

@@ -149,7 +149,7 @@ def bench(parts: Sequence[JonesTerm] = (), layout: Layout | None = None) -> Samp
     p, q, r = layout.axes[0]
     start = Direction(0.0, 0.0)
     at = Sampling.build(layout, Time(START, scale="utc") + MINUTES * u.min, freq_hz, np.zeros(1), np.zeros(1), start)
-    ra, dec = _icrs(at.earth, np.stack([np.cos(0.44) * r + np.sin(0.44) * p, 0.6 * q - 0.8 * r]))
+    ra, dec = icrs(at.earth, np.stack([np.cos(0.44) * r + np.sin(0.44) * p, 0.6 * q - 0.8 * r]))
     centre = Direction(float(ra[0]), float(dec[0]))
     near = offset(centre, np.array([0.0, 0.03, -0.2, 0.35]), np.array([0.0, -0.02, 0.1, 0.2]))
     return replace(at, ra_rad=np.append(near[0], ra[1]), dec_rad=np.append(near[1], dec[1]), centre=centre)
@@ -167,7 +167,7 @@ def hard_places(at: Sampling) -> Sampling:
     places = [[r, p, q, -p, -r, p - 1e-3 * r, r + 1e-9 * p] for p, q, r in (axes[0], axes[-1])]
     seen = np.array(places).reshape(-1, 3)
     seen /= np.linalg.norm(seen, axis=1, keepdims=True)
-    ra, dec = _icrs(at.earth, seen)
+    ra, dec = icrs(at.earth, seen)
     ra, dec = np.append(ra, [0.0, 1.0]), np.append(dec, [np.pi / 2, -np.pi / 2])
     hard = replace(at.block(slice(0, 1), slice(None)).towards(ra, dec), layout=layout)
     exact = np.array(hard.itrf)
@@ -175,7 +175,7 @@ def hard_places(at: Sampling) -> Sampling:
     return replace(hard, seen=exact)
 
 
-def _icrs(earth: EarthFrame, itrf: Float) -> tuple[Float, Float]:
+def icrs(earth: EarthFrame, itrf: Float) -> tuple[Float, Float]:
     """Right ascension and declination (S,) seen at ITRF unit vectors (S, 3) at the first time: `itrf` inverted."""
     v = earth.velocity[0]
     d = itrf @ earth.matrices[0]

@@ -18,6 +18,9 @@ Structure = Literal["scalar", "diagonal", "full"]
 PerStation = Literal["shared", "frame", "own"]
 
 
+Knob = tuple[str, str, tuple[float, ...]]  # field, its unit, and values of it: what a contest turns
+
+
 class Simplified(NamedTuple):
     """What is left of a term for a scene: the term or `None`, why, and a bound on the error of J.
 
@@ -137,6 +140,7 @@ class ElementBeam(JonesTerm):
     per_station: ClassVar[PerStation] = "frame"
     blind_below_horizon: ClassVar[bool] = True
     real: ClassVar[bool] = False
+    knob: ClassVar[Knob | None] = None
 
     def in_chain(self) -> ElementBeam:
         """The element with the sign of the fringe: itself if it is real, or its conjugate."""

@@ -12,6 +12,7 @@ from instrument.errors import unused_ledger
 from instrument.jones.chain import Chain
 from instrument.memory import give_back
 from instrument.pipeline.folder import RunFolder
+from instrument.pipeline.on_curve import on_curve
 from instrument.pipeline.planning import plan_run
 from instrument.pipeline.progress import Progress, progress_bar
 from instrument.pipeline.record import Result, costs, json_text, record, summary
@@ -164,6 +165,7 @@ def _write(result: Result, tables: dict[str, Any], folder: Path) -> None:
     cards = [card for stage in made for card in stage.cards()]
     # all but the page itself is written by now
     what |= costs(result.seconds | {WRITE: time.perf_counter() - begin}, result.grown, result.whole)
+    sections += on_curve(what, draw)
     page = page_of_run(what, cards, sections, long)
     write_page(page, folder / "report.html")
     what |= costs(result.seconds | {WRITE: time.perf_counter() - begin}, result.grown, result.whole)

@@ -6,15 +6,35 @@ from collections.abc import Callable
 from typing import Any
 
 from instrument.errors import InputError, did_you_mean
-from instrument.precision import calibrators, engines, faraday, foregrounds, imagers, photometry, spectra
+from instrument.precision import (
+    calibrators,
+    elements,
+    engines,
+    faraday,
+    foregrounds,
+    imagers,
+    photometry,
+    plain,
+    runs,
+    spectra,
+    telescopes,
+)
 from instrument.precision.contest import Contest, Form
 from instrument.registry import available
 
 FULL = Form()
 
+
+def _engines(plugins: dict[str, Any], form: Form) -> list[Contest]:
+    """Those of engines alone, and where other programs are drawn in also those that these can do."""
+    return [*engines.contests(plugins, form), *(plain.contests(plugins, form) if form.peers else ())]
+
+
 # kind of plugin -> its contests, of plugins by name
 OF_KIND: dict[str, Callable[[dict[str, Any], Form], list[Contest]]] = {
-    "engines": engines.contests,
+    "engines": _engines,
+    "elements": elements.contests,
+    "telescopes": telescopes.contests,
     "calibrators": calibrators.contests,
     "imagers": imagers.contests,
     "foregrounds": foregrounds.contests,
@@ -68,7 +88,8 @@ def contests_of(what: str, plugins: tuple[str, ...] = (), form: Form = FULL) -> 
         return OF_STAGE[what](form)
     if kinds:
         return OF_KIND[kinds[0]](_chosen(kinds[0], plugins), form)
-    return engines.contests_of_scene(what, _chosen("engines", plugins), form)
+    chosen = _chosen("engines", plugins)
+    return [*engines.contests_of_scene(what, chosen, form), *runs.contests_of_scene(what, chosen, form)]
 
 
 def _chosen(kind: str, names: tuple[str, ...]) -> dict[str, Any]:

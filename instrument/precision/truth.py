@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from instrument.jones.base import ElementBeam
+from instrument.jones.station import StationBeam
 from instrument.predict.base import Problem
 
 LIGHT = np.longdouble(299792458)
@@ -252,9 +253,25 @@ TERMS = {
 }
 
 
+def has_truth(term: Any) -> bool:
+    """Whether its formula is known in extended precision: those of this package are, others say so themselves."""
+    ours = type(term).__module__.startswith("instrument") and type(term).__name__ in TERMS
+    return (ours or hasattr(term, "truth")) and (not isinstance(term, StationBeam) or has_truth(term.element))
+
+
 def of_term(term: Any, at: Any, g: Any) -> Any:
     """Jones matrices of a term: its own `truth(at, geometry)` where it has one."""
     return term.truth(at, g) if hasattr(term, "truth") else TERMS[type(term).__name__](term, at, g)
+
+
+def chain_jones(terms: Any, at: Any, g: Any) -> Any:
+    """Product of terms of a chain, receiver to sky, broadcastable to (T, F, A, S, 2, 2)."""
+    jones = matrix(1, 0, 0, 1)
+    for term in terms:
+        found = of_term(term, at, g)
+        # an element is given for exp(+i omega t), the fringe is of exp(-i omega t)
+        jones = product(jones, found.conj() if isinstance(term, ElementBeam) else found)
+    return jones
 
 
 # Sky and sums --------------------------------------------------------------------------------------------------------
@@ -305,12 +322,7 @@ def visibilities(problem: Problem) -> Any:
     at = problem.at
     sky: Any = problem.sky
     g = geometry(at)
-    jones = matrix(1, 0, 0, 1)
-    for term in problem.chain.terms:
-        found = of_term(term, at, g)
-        # an element is given for exp(+i omega t), the fringe is of exp(-i omega t)
-        jones = product(jones, found.conj() if isinstance(term, ElementBeam) else found)
-    jones = np.broadcast_to(jones, (*at.shape, 2, 2))
+    jones = np.broadcast_to(chain_jones(problem.chain.terms, at, g), (*at.shape, 2, 2))
     i, q, u, v = np.moveaxis(stokes(sky, at.freq_hz), -1, 0)
     bright = matrix(i + q, u + I * v, u - I * v, i - q)[None]
     a, b = problem.antenna1, problem.antenna2

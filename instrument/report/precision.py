@@ -116,3 +116,28 @@ def _wrapped(text: str, width: int = 44) -> str:
         else:
             line = f"{line} {word}".strip()
     return "\n".join([*lines, line])
+
+
+@styled
+def point_figure(
+    rows: Sequence[tuple[str, float, float, float]], engine: str, seconds: float, errors: tuple[float, float]
+) -> Figure:
+    """Curves of engines, rows of (engine, asked, seconds a visibility, error), and one run with its error and bound."""
+    figure = Figure(figsize=(6.4, 4.6), layout="constrained")
+    ax = figure.subplots()
+    ax.set(xscale="log", yscale="log", xlabel="wall seconds a visibility", ylabel="error over the total flux")
+    for k, name in enumerate(dict.fromkeys(row[0] for row in rows)):
+        own = [row for row in rows if row[0] == name]
+        x, y = ([row[i] for row in own] for i in (2, 3))
+        ax.plot(x, y, color=COLOURS[k], marker=MARKS[k], ms=6, lw=1.2, label=name)
+        for row in (own[0], own[-1]):
+            ax.annotate(f"{row[1]:.2g}", row[2:], xytext=(5, 4), textcoords="offset points", fontsize=10, color=INK)
+    error, bound = errors
+    ax.plot([seconds, seconds], [error, bound], color=INK, lw=1.2)
+    ax.plot(seconds, bound, "_", color=INK, ms=12, mew=1.5)
+    ax.plot(seconds, error, "*", color="#E69F00", mec=INK, ms=18, label=f"this run ({engine})", zorder=5)
+    low, high = ax.get_xlim()
+    log_numbers(ax.xaxis, high / low)
+    ax.grid(color="#dddddd", lw=0.6)
+    ax.legend(fontsize=11, frameon=False)
+    return figure

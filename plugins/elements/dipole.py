@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field
 
-from instrument.jones.base import ElementBeam
+from instrument.jones.base import ElementBeam, Knob
 from instrument.mat2 import UNIT, pack
 from instrument.observe.directions import LIGHT
 from instrument.observe.sampling import Sampling
@@ -23,6 +23,11 @@ class CrossedDipole(ElementBeam):
     """
 
     real: ClassVar[bool] = True
+    knob: ClassVar[Knob | None] = (
+        "height",
+        "m",
+        (0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.3, 1.7, 2.2),
+    )
     height: Annotated[Metres, Field(gt=0)]
     x_azimuth: Radians = 0.0
 

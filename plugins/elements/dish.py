@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from instrument import mat2
-from instrument.jones.base import ElementBeam, Structure
+from instrument.jones.base import ElementBeam, Knob, Structure
 from instrument.observe.directions import LIGHT, separation
 from instrument.observe.sampling import Sampling
 from instrument.units import Complex, Float, Hertz, Metres, Radians
@@ -28,6 +28,7 @@ class Airy(ElementBeam):
 
     structure: ClassVar[Structure] = "scalar"
     real: ClassVar[bool] = True
+    knob: ClassVar[Knob | None] = ("diameter", "m", (3.0, 6.0, 12.0, 25.0, 35.0))
     diameter: Annotated[Metres, Field(gt=0)]
 
     def peak(self, at: Sampling) -> float:
@@ -60,6 +61,7 @@ class Gaussian(ElementBeam):
 
     structure: ClassVar[Structure] = "scalar"
     real: ClassVar[bool] = True
+    knob: ClassVar[Knob | None] = ("fwhm", "deg", (1.0, 3.0, 10.0, 30.0, 60.0))
     fwhm: Annotated[Radians, Field(gt=0)]
     frequency: Hertz | None = None
 

@@ -210,7 +210,7 @@ def case(name):
 
 def zenith():
     """The direction over the first station in the middle of the one integration."""
-    from instrument.conformance.bench import _icrs
+    from instrument.conformance.bench import icrs
     from instrument.observe.directions import earth_frame
 
     stations = layout()
@@ -218,7 +218,7 @@ def zenith():
         phase_centre=CENTRE, start="2015-06-10T22:00:00", duration=10 * u.min, interval=10 * u.min,
         frequencies=[150] * u.MHz,
     )  # fmt: skip
-    ra, dec = _icrs(earth_frame(observation.times(stations), stations.centre_m), stations.axes[:1, 2])
+    ra, dec = icrs(earth_frame(observation.times(stations), stations.centre_m), stations.axes[:1, 2])
     return SkyCoord(ra[0] * u.rad, dec[0] * u.rad)
 
 

@@ -1,6 +1,5 @@
 """What the programs of others need to start, a LOFAR data set for them, and directions as they have them."""
 
-import importlib.util
 import os
 from importlib import metadata
 from pathlib import Path
@@ -27,11 +26,10 @@ def peer_environment(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def make_ms(peer_environment):
-    """`make_ms` of lofar_ms.py, which tests in importlib mode cannot import by name."""
-    spec = importlib.util.spec_from_file_location("lofar_ms", Path(__file__).with_name("lofar_ms.py"))
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.make_ms
+    """`make_ms` of instrument.precision.lofar_ms, once the programs that read its sets find their data."""
+    from instrument.precision.lofar_ms import make_ms
+
+    return make_ms
 
 
 @pytest.fixture(scope="session")

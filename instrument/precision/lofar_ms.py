@@ -4,29 +4,43 @@ Positions, axes, tiles, dipoles, times and uvw are the package's numbers in doub
 other program and not another survey. UVW has the sign of Measurement Sets: position of ANTENNA2 minus ANTENNA1.
 """
 
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from casacore import tables
 
-from instrument import Sampling, StationBeam
-from instrument.observe.sampling import mjd_seconds
+from instrument.jones.station import StationBeam
+from instrument.model import Instrument
+from instrument.observe.observation import Observation
+from instrument.observe.sampling import Sampling, mjd_seconds
 
-METRES = {"QuantumUnits": ["m", "m", "m"]}
+METRES: dict[str, Any] = {"QuantumUnits": ["m", "m", "m"]}
 POSITION = METRES | {"MEASINFO": {"type": "position", "Ref": "ITRF"}}
 DIRECTION = {"QuantumUnits": ["rad", "rad"], "MEASINFO": {"type": "direction", "Ref": "J2000"}}
-KINDS = {"i": ("int", 0), "f": ("double", 0.0), "b": ("bool", False)}
+KINDS: dict[str, tuple[str, Any]] = {"i": ("int", 0), "f": ("double", 0.0), "b": ("bool", False)}
 
 
-def make_ms(path, lofar, observation, columns=("DATA",), turned=False):
+def make_ms(
+    path: str | PathLike[str],
+    lofar: Instrument,
+    observation: Observation,
+    columns: Sequence[str] = ("DATA",),
+    turned: bool = False,
+) -> None:
     """Write the set at `path`, `columns` zero and weights 1; rows in time order, then in that of `layout.baselines`.
 
     `turned` makes UVW position of ANTENNA1 minus ANTENNA2: the sign with which DP3's fringes agree with its beams.
     """
+    from casacore import tables
+
     path, layout, centre = str(path), lofar.layout(), observation.phase_centre
-    count, channels, interval = len(layout), len(observation.freq_hz), observation.interval
+    channels, interval = len(observation.freq_hz), observation.interval
     times = observation.times(layout)
-    at = Sampling.build(layout, times, observation.freq_hz, [centre.ra_rad], [centre.dec_rad], centre)
+    at = Sampling.build(layout, times, observation.freq_hz, centre.ra_rad, centre.dec_rad, centre)
     a, b = layout.baselines
     slots = mjd_seconds(times)
     rows = len(slots) * len(a)
@@ -48,7 +62,14 @@ def make_ms(path, lofar, observation, columns=("DATA",), turned=False):
         )
         for name in columns:
             ms.putcolkeyword(name, "LOFAR_APPLIED_BEAM_MODE", "None")
+    _antennas(path, lofar)
+    _set_up(path, observation, (slots[0] - interval / 2, slots[-1] + interval / 2))
 
+
+def _antennas(path: str, lofar: Instrument) -> None:
+    """Stations, their tiles and dipoles, and feeds."""
+    layout = lofar.layout()
+    count = len(layout)
     numbers = np.arange(count, dtype=np.int32)
     _subtable(
         path,
@@ -88,6 +109,11 @@ def make_ms(path, lofar, observation, columns=("DATA",), turned=False):
             "POLARIZATION_TYPE": {"shape": [count, 2], "array": ["X", "Y"] * count},
         },
     )
+
+
+def _set_up(path: str, observation: Observation, span: tuple[float, float]) -> None:
+    """Pointing, channels, correlations, and the range of times."""
+    centre, channels = observation.phase_centre, len(observation.freq_hz)
     pointings = ("DELAY_DIR", "PHASE_DIR", "REFERENCE_DIR", "LOFAR_TILE_BEAM_DIR")
     towards = np.array([[[centre.ra_rad, centre.dec_rad]]])
     _subtable(path, "FIELD", dict.fromkeys(pointings, towards), {"LOFAR_TILE_BEAM_DIR": DIRECTION})
@@ -114,12 +140,13 @@ def make_ms(path, lofar, observation, columns=("DATA",), turned=False):
         },
     )
     _subtable(path, "DATA_DESCRIPTION", {"SPECTRAL_WINDOW_ID": [0], "POLARIZATION_ID": [0]})
-    span = np.array([[slots[0] - interval / 2, slots[-1] + interval / 2]])
-    _subtable(path, "OBSERVATION", {"TELESCOPE_NAME": ["LOFAR"], "TIME_RANGE": span})
+    _subtable(path, "OBSERVATION", {"TELESCOPE_NAME": ["LOFAR"], "TIME_RANGE": np.array([span])})
 
 
-def _main_description(channels, columns):
+def _main_description(channels: int, columns: Sequence[str]) -> Any:
     """The required columns of the main table, and those that hold (channel, correlation) arrays."""
+    from casacore import tables
+
     tiled = {"shape": [channels, 4], "datamanagertype": "TiledColumnStMan"}
     cubes = [tables.makearrcoldesc(n, 0j, valuetype="complex", datamanagergroup=n, **tiled) for n in columns]
     cubes.append(tables.makearrcoldesc("WEIGHT_SPECTRUM", 0.0, valuetype="float", datamanagergroup="WS", **tiled))
@@ -128,8 +155,10 @@ def _main_description(channels, columns):
     return found
 
 
-def _subtable(path, name, values, keywords=None):
+def _subtable(path: str, name: str, values: Mapping[str, Any], keywords: Mapping[str, Any] | None = None) -> None:
     """Fill a subtable, made if it is not there; columns it lacks are added, with the type of their values."""
+    from casacore import tables
+
     where = f"{path}/{name}"
     if not Path(where).exists():
         tables.table(where, tables.maketabdesc([_describe(*item) for item in values.items()]), ack=False).close()
@@ -145,7 +174,9 @@ def _subtable(path, name, values, keywords=None):
         _fill(sub, values)
 
 
-def _describe(name, value):
+def _describe(name: str, value: Any) -> Any:
+    from casacore import tables
+
     if isinstance(value, list):
         return tables.makescacoldesc(name, "", valuetype="string")
     kind, zero = KINDS[value.dtype.kind]
@@ -154,7 +185,7 @@ def _describe(name, value):
     return tables.makearrcoldesc(name, zero, valuetype=kind, ndim=value.ndim - 1)
 
 
-def _fill(table, values):
+def _fill(table: Any, values: Mapping[str, Any]) -> None:
     table.addrows(len(next(iter(values.values()))))
     for column, value in values.items():
         table.putcol(column, value)

@@ -1,0 +1,61 @@
+"""Where a run stands on the curve of error against time of its scene, as the contest of engines has measured it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+
+from instrument.pipeline.scene_text import read_tables, shipped
+from instrument.pipeline.work import PREDICT
+from instrument.report.page import Figures, Section
+
+ALIKE = ("instrument", "sky")  # tables that must be those of the shipped scene: cost and error hang on them
+
+
+def on_curve(record: Mapping[str, Any], draw: Callable[..., Any]) -> list[Section]:
+    """The section with the run's own point on the curve of its scene; none where there is no curve, or no check."""
+    from instrument.report.precision import point_figure
+
+    check = record.get("checks", {}).get("prediction") or {}
+    rows = curves().get(record["name"])
+    error, seen = check.get("error"), check.get("seen")
+    if rows is None or not seen or not check.get("passed") or not error or not np.isfinite(error) or not _alike(record):
+        return []
+    count = math.prod(seen[axis][1] for axis in ("times", "channels", "baselines"))
+    seconds = record["stages"][PREDICT]["seconds"]["measured"] / count
+    if not seconds > 0:
+        return []
+    meta = curves()["meta"]
+    text = (
+        "Error of the prediction against seconds a visibility: this run (star; its error as the check found it, its "
+        f"bound above), and the engines as `{meta['command']}` measured them on {meta['made'][:10]} "
+        f"({meta['machine']}); beside a mark what was asked."
+    )
+    figure = point_figure(rows, record["plan"]["engine"], seconds, (error, check["bound"]))
+    return [Section("Error against run time", [Figures([draw("precision", figure, text)])])]
+
+
+def _alike(record: Mapping[str, Any]) -> bool:
+    """Whether what is predicted is that of the shipped scene of this name."""
+    if record["name"] not in shipped():
+        return False
+    known = read_tables(record["name"])
+    return all(known.get(name) == record["scene"].get(name) for name in ALIKE)
+
+
+@cache
+def curves() -> dict[str, Any]:
+    """Rows (engine, asked, seconds a visibility, error) of scenes that were measured, by name; "meta" says how."""
+    from astropy.table import QTable
+
+    path = files("instrument.data") / "precision_engines.ecsv"
+    table = QTable.read(path, format="ascii.ecsv")
+    found: dict[str, Any] = {"meta": table.meta}
+    for scene, *row in table.iterrows("scene", "engine", "asked", "seconds_each", "error"):
+        found.setdefault(str(scene), []).append(tuple(row))
+    return found
