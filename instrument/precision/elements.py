@@ -12,7 +12,7 @@ from instrument.jones.base import ElementBeam
 from instrument.observe.directions import EarthFrame
 from instrument.observe.layout import Layout
 from instrument.observe.sampling import Sampling
-from instrument.precision.contest import Contest, Entry, Form, Trial
+from instrument.precision.contest import UNSET, Contest, Entry, Form, Trial
 from instrument.precision.truth import geometry, has_truth, matrix, of_term, product
 from instrument.registry import names, plugin_class
 from instrument.units import Complex, Direction, Float
@@ -42,11 +42,12 @@ def towards(freq_hz: float, angle: Float, azimuth: Float) -> Sampling:
     )  # fmt: skip
 
 
-def distance(found: Any, truth: Any) -> tuple[float, float]:
-    """Largest error of matrices (..., 2, 2) over the largest true one (Frobenius); rms error of their leakage."""
+def distance(found: Any, truth: Any) -> Trial:
+    """Largest error of matrices (..., 2, 2) over the largest true one (Frobenius); that of their leakage."""
     size, apart = (np.sqrt((np.abs(x) ** 2).sum((-2, -1))) for x in (truth, found - truth))
-    leaked = leakage(found) - leakage(truth)
-    return float(apart.max() / size.max()), float(np.sqrt(np.mean(leaked**2)))
+    leaked = np.abs(leakage(found) - leakage(truth))
+    error, rms = float(apart.max() / size.max()), float(np.sqrt(np.mean(leaked**2)))
+    return Trial(error, rms, user_max=float(leaked.max()))
 
 
 def leakage(jones: Any) -> Any:
@@ -110,7 +111,7 @@ def _sampled(name: str, cls: Any, form: Form) -> Contest:
             Entry(f"{name}, table, linear", table(1)),
             Entry(f"{name}, table, cubic", table(3)),
         ),
-        judge=lambda found, asked: Trial(*distance(found, state["truth"])),
+        judge=lambda found, asked: distance(found, state["truth"]),
         error=f"largest error of a matrix within {STEEPEST:g} deg of the zenith, over the largest matrix",
         error_user="rms error of the intrinsic leakage, 1/sqrt(IXR)",
         truth="the formula of the element in extended precision, where it gives one; else the element itself",
@@ -180,7 +181,7 @@ def _stand_in(band: str, elements: dict[str, Any], form: Form) -> Contest:
                 raise RefusedError("its receptors turn with their mount, LOFAR's stand still: it is another antenna")
             return np.broadcast_to(element.jones(at), (*at.shape, 2, 2))[0, 0, 0]
 
-        values = (0.0,) if cls.knob is None else cls.knob[2]
+        values = (UNSET,) if cls.knob is None else cls.knob[2]
         label = name if cls.knob is None else f"{name} ({cls.knob[0]}{', ' * bool(cls.knob[1])}{cls.knob[1]})"
         few = values[:1] if _is_another(cls, band, lofar) else values[::3] if form.quick else values
         return Entry(label, answer, few)
@@ -189,9 +190,9 @@ def _stand_in(band: str, elements: dict[str, Any], form: Form) -> Contest:
         name=f"a model of LOFAR's {band.upper()} dipole, {count} directions",
         kind="elements",
         knob="own setting",
-        values=(0.0,),
+        values=(UNSET,),
         entries=tuple(entry(name, cls) for name, cls in elements.items()),
-        judge=lambda found, asked: Trial(*distance(differential(found.astype(np.clongdouble)), truth)),
+        judge=lambda found, asked: distance(differential(found.astype(np.clongdouble)), truth),
         error=f"largest error within 60 deg of the zenith, {within(lofar) / 1e6:g} MHz, once calibrated 5 deg from it",
         error_user="rms error of its leakage, 1/sqrt(IXR)",
         truth="the polynomials that Hamaker (2011) fitted to a simulation of the antenna, in extended precision",

@@ -17,23 +17,14 @@ from instrument.model import Instrument
 from instrument.observe.layout import geodetic_axes
 from instrument.observe.sampling import Sampling, times_of
 from instrument.precision.contest import Entry
+from instrument.precision.cube_peers import quiet
 from instrument.precision.truth import LIGHT, cis, real, stokes
 from instrument.predict.base import Problem
 from instrument.units import Complex, Float
 
 # program -> module, and the package whose version is printed
-LOFAR = ("lofar-hba", "lofar-lba")  # telescopes that EveryBeam knows from such a data set
-PEERS = {"EveryBeam": ("everybeam", "everybeam"), "matvis": ("matvis", "matvis"), "fftvis": ("fftvis", "fftvis")}
-
-
-def there(name: str) -> bool:
-    """Whether a program is installed."""
-    return find_spec(PEERS[name][0]) is not None
-
-
-def labelled(name: str, what: str = "") -> str:
-    """A program with its version, and what of it is meant."""
-    return f"{name} {metadata.version(PEERS[name][1])}{', ' * bool(what)}{what}"
+LOFAR = ("lofar-hba", "lofar-lba")  # telescopes that EveryBeam knows, from a data set
+EVERYBEAM, DRIFTING = ("everybeam",), ("matvis", "fftvis")
 
 
 class Horizon(NamedTuple):
@@ -67,7 +58,7 @@ def station_beams(telescope: Instrument, at: Sampling, shared: Callable[[float],
 
     It is given ITRF vectors, so that its directions are the same, and answers in the basis of the antennas.
     """
-    if not there("EveryBeam") or find_spec("casacore") is None:
+    if find_spec("everybeam") is None or find_spec("casacore") is None:
         return []
     from astropy import units as u
 
@@ -96,12 +87,10 @@ def station_beams(telescope: Instrument, at: Sampling, shared: Callable[[float],
         return Horizon(found, middle)
 
     answer.folder = folder  # type: ignore[attr-defined]  # which is removed when nobody asks any more
-    return [Entry(labelled("EveryBeam"), answer)]
+    return [Entry("everybeam", answer, peer=True)]
 
 
 # matvis and fftvis -------------------------------------------------------------------------------------------------
-
-DRIFTING = ("matvis", "fftvis")
 
 
 class Drifting(NamedTuple):
@@ -112,12 +101,11 @@ class Drifting(NamedTuple):
 
 def drifting(problem: Problem) -> list[Entry]:
     """matvis in its two precisions, and fftvis, whose knob is the tolerance, on one thread each."""
-    made = []
-    if there("matvis"):
-        made.append(Entry(labelled("matvis"), _answer(problem, _matvis), (1e-6, 1e-15)))
-    if there("fftvis"):
-        made.append(Entry(labelled("fftvis"), _answer(problem, _fftvis)))
-    return made
+    made = (
+        Entry("matvis", _answer(problem, _matvis), (1e-6, 1e-15), peer=True),
+        Entry("fftvis", _answer(problem, _fftvis), peer=True),
+    )
+    return [entry for entry in made if find_spec(entry.plugin) is not None]
 
 
 def _answer(problem: Problem, simulate: Callable[[Any, dict[str, Any], float], Complex]) -> Callable[[float], Drifting]:
@@ -126,7 +114,7 @@ def _answer(problem: Problem, simulate: Callable[[Any, dict[str, Any], float], C
     def answer(asked: float) -> Drifting:
         from threadpoolctl import threadpool_limits
 
-        with threadpool_limits(1):
+        with threadpool_limits(1), quiet():
             return Drifting(simulate(problem, given, asked))
 
     return answer

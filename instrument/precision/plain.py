@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -17,15 +18,15 @@ from instrument.precision.engines import FULL, SHORT
 from instrument.precision.truth import visibilities
 from instrument.scene import Scene
 
-SOURCES, TIMES = (500, 5000), 4
+SOURCES, TIMES = ((300,), (300, 3000, 30000)), 4
 BASELINES = 60  # of which the truth is worked out
 SIDE, PITCH = 10, 14.6  # stations along a side of the lattice, m between them: the distance of HERA's dishes
 
 
 def contests(engines: Mapping[str, Any], form: Form) -> list[Contest]:
     """One for each array: unpolarized sources within 20 deg, four integrations, one channel, one thread each."""
-    count = SOURCES[0] if form.quick else SOURCES[1]
-    return [contest(name, layout, count, engines, form) for name, layout in arrays().items()]
+    counts = SOURCES[0] if form.quick else SOURCES[1]
+    return [contest(name, layout, count, engines, form) for name, layout in arrays().items() for count in counts]
 
 
 def arrays() -> dict[str, Layout]:
@@ -61,7 +62,7 @@ def contest(name: str, layout: Layout, count: int, engines: Mapping[str, Any], f
     chosen = np.random.default_rng(4).choice(len(full.antenna1), BASELINES, replace=False)
     few = full.between(full.antenna1[chosen], full.antenna2[chosen])
     truth = visibilities(few)
-    drifting: Any = peers.drifting_truth(few) if form.peers and any(map(peers.there, peers.DRIFTING)) else None
+    drifting: Any = peers.drifting_truth(few) if form.peers and find_spec("matvis") is not None else None
 
     def judge(found: Any, asked: float) -> Trial:
         if isinstance(found, peers.Drifting):
@@ -78,6 +79,10 @@ def contest(name: str, layout: Layout, count: int, engines: Mapping[str, Any], f
         entries += peers.drifting(full)
     return Contest(
         name=f"predict {name}, {count} sources, without beams",
+        family=f"predict {name} without beams",
+        size=count,
+        size_word="sources",
+        peers=peers.DRIFTING,
         kind="engines",
         knob="tolerance",
         values=SHORT[::2] if form.quick else FULL[::2],

@@ -70,12 +70,9 @@ def _of(name: str, cls: Any, form: Form) -> Contest:
 
     def judge(found: Any, asked: float) -> Trial:
         if isinstance(found, peers.Horizon):
-            return Trial(
-                *distance(
-                    product(inverse(found.centre.astype(np.clongdouble)), found.jones.astype(np.clongdouble)), alone()
-                )
-            )
-        return Trial(*distance(found, truth))
+            centre, jones = (x.astype(np.clongdouble) for x in found)
+            return distance(product(inverse(centre), jones), alone())
+        return distance(found, truth)
 
     def entry(label: str, one: Instrument) -> Entry:
         def answer(held: float) -> Complex:
@@ -93,7 +90,7 @@ def _of(name: str, cls: Any, form: Form) -> Contest:
         for field, value in VARIANTS.items()
         if field in cls.model_fields
     ]
-    if form.peers and truth is not None and name in peers.LOFAR:
+    if form.peers and name in peers.LOFAR:
         entries += peers.station_beams(telescope, at, shared)
     stations = len(telescope.layout())
     return Contest(
@@ -103,6 +100,7 @@ def _of(name: str, cls: Any, form: Form) -> Contest:
         values=HELD[::2] if form.quick else HELD,
         entries=tuple(entries),
         judge=judge,
+        peers=peers.EVERYBEAM if name in peers.LOFAR else (),
         error=f"largest error of a differential matrix over the largest, {stations} stations, {TIMES} min, "
         f"{2 * np.rad2deg(FIELD):.0f} deg",
         error_user="rms error of the intrinsic leakage, 1/sqrt(IXR)",

@@ -35,10 +35,12 @@ def test_leakage_is_that_of_ixr_and_keeps_its_digits_where_there_is_none():
 
 
 def test_distance_is_relative_to_the_largest_matrix():
-    one = np.tile(np.eye(2), (3, 1, 1))
-    error, leaked = distance(one + 1e-3 * np.eye(2), one)
+    one, worse = np.tile(np.eye(2), (3, 1, 1)), np.tile(np.diag([1.1, 0.9]), (3, 1, 1))
+    error, leaked, *_ = distance(one + 1e-3 * np.eye(2), one)
     assert error == pytest.approx(1e-3) and leaked == pytest.approx(0.0, abs=1e-15)
-    assert distance(np.tile(np.diag([1.1, 0.9]), (3, 1, 1)), one)[1] == pytest.approx(0.1)
+    worse[1:] = one[1:]
+    found = distance(worse, one)
+    assert found.error_user == pytest.approx(0.1 / np.sqrt(3)) and found.user_max == pytest.approx(0.1)
     assert differential(np.array([2j * np.eye(2), np.diag([1.0, 3.0])])) == pytest.approx(
         np.array([np.eye(2), np.diag([-0.5j, -1.5j])])
     )
@@ -62,13 +64,13 @@ def test_our_elements_are_right_to_rounding_and_finer_tables_are_better(few):
         assert formula < 1e-13  # rounding of trigonometric functions at angles of a few rad
         for kind in ("linear", "cubic"):
             errors = [trial.error for (name, _), trial in rows.items() if name.endswith(kind)]
-            assert len(errors) == 2 and errors[0] > 3 * errors[1] > formula
+            assert len(errors) == 2 and errors[0] > 3 * errors[1] > 3 * formula
 
 
 def test_a_dipole_is_a_rough_model_of_lofars_and_a_dish_is_none(few):
     for contest in contests_of("elements", ("hamaker", "dipole"), QUICK)[-2:]:
         rows = told(contest)
-        itself = rows["hamaker", 0.0]
+        (itself,) = (trial for (name, _), trial in rows.items() if name == "hamaker")
         assert itself.error < 1e-13 and itself.error_user < 1e-13
         assert 1e-2 < min(trial.error for (name, _), trial in rows.items() if name.startswith("dipole")) < 0.5
     dish = contests_of("elements", ("airy",), QUICK)[-1].entries[0]

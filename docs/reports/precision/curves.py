@@ -2,7 +2,7 @@
 
     instrument precision engines --out runs/engines && python docs/reports/precision/curves.py runs/engines
 
-Writes instrument/data/precision_engines.ecsv: of each scene, engine and tolerance the error and the seconds a visibility.
+Writes instrument/data/precision_engines.ecsv: error and seconds a visibility of each scene, engine and tolerance.
 """
 
 import sys
