@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from instrument import mat2
+from instrument.jones.base import ElementBeam
 from instrument.observe.directions import EARTH_RATE, LIGHT, separation, tangents
 from instrument.plan import Item, count_of
 from instrument.predict.base import Problem
@@ -16,12 +19,15 @@ from instrument.units import Float, Int, si_prefix
 SHAPED = 24  # extended sources across which the beam is worked out; the effect of the others is scaled from theirs
 JONES = 1.5e5  # station Jones matrices spent on it, spread over times and channels
 SPOKES = 6
+NEAR_ZENITH, SPREAD = np.sin(np.deg2rad(1.0)), 24  # how near a zenith, and from how many azimuths it is looked at
 NODES, WEIGHTS = np.polynomial.laguerre.laggauss(3)  # rings of a two-dimensional Gaussian, in r^2 / 2
 
 
 def not_modelled(problem: Problem, scale_jy: float) -> list[Item]:
     """Every such item; those whose `bound` is not 0 are part of the bound of a plan, relative to `scale_jy`."""
-    return [*_smearing(problem), *_extended(problem, scale_jy), *_no_horizon(problem), *_doubts(problem)]
+    return [
+        *_smearing(problem), *_extended(problem, scale_jy), *_no_horizon(problem), *_zenith(problem), *_doubts(problem),
+    ]  # fmt: skip
 
 
 def _doubts(problem: Problem) -> list[Item]:
@@ -60,6 +66,26 @@ def _no_horizon(problem: Problem) -> list[Item]:
     what = "cell" if problem.sky.kind == "image" else "direction"
     text = f"{count_of(int(below.sum()), what)} ({si_prefix(hidden, 'Jy')}) below it, {when}, seen in full"
     return [Item("horizon", f"no term is blind there: {text}")]
+
+
+def _zenith(problem: Problem) -> list[Item]:
+    """Directions that come within a degree of a zenith where an element is known to be no single field."""
+    elements = [t for t in problem.chain.parts if isinstance(t, ElementBeam) and t.zenith_seam]
+    near = int(((problem.at.rising.zenith < NEAR_ZENITH) & (problem.at.rising.highest > 0.5)).sum()) if elements else 0
+    if not near:
+        return []
+    at = problem.at.block(slice(0, 1), slice(None)).one_per_frame()
+    angle = 2 * np.pi * np.arange(SPREAD) / SPREAD
+    local = np.stack([1e-9 * np.cos(angle), 1e-9 * np.sin(angle), np.ones(SPREAD)], axis=1)
+    around = replace(at.towards(np.zeros(SPREAD), np.zeros(SPREAD)), seen=(local @ at.layout.axes[0])[None])
+    turn = mat2.pack(np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle))
+    out = []
+    for element in elements:
+        ground = mat2.mul(element.jones(around)[0, :, 0], turn)
+        apart = float(np.abs(ground - ground[:, :1]).max() / np.abs(ground[:, 0]).max())
+        text = f"J of {element.called} there depends on the azimuth by {apart:.1e}, as its published model has it"
+        out.append(Item("zenith", f"{count_of(near, 'direction')} within 1 deg of it: {text}"))
+    return out
 
 
 def _extended(problem: Problem, scale_jy: float) -> list[Item]:

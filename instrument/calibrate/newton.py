@@ -83,10 +83,11 @@ def solved_together(lanes: Side, jones: Complex) -> tuple[Complex, Float, Int, F
     return jones, step, count, np.array(history)
 
 
-def factored(lanes: Side, jones: Complex, share: Float, hard: list[int], most: float) -> None:
+def factored(lanes: Side, jones: Complex, share: Float, hard: list[int], most: float, swept: list[int]) -> None:
     """Factors of lanes anew at matrices (L, A, 2, 2), for their errors.
 
-    Of what was solved from another start since, `hard`, and where noise is left and they went on by `most`.
+    Of what was solved from another start since, `hard`, and where noise is left and they went on by `most`; of lanes
+    `swept` without any, and so without a prior.
     """
     far = {k: _relative(jones[k] - one.at, one.at) > most and share[k] > EXACT for k, one in lanes.factors.items()}
     lanes.common.begin(jones)
@@ -94,6 +95,13 @@ def factored(lanes: Side, jones: Complex, share: Float, hard: list[int], most: f
         if k in hard or far[k]:
             lane = _Lane(lanes, k)
             lanes.common.weigh(k, float(share[k]) ** 2)
+            lane.factor_at(jones[k], None)
+            assert lane.factor is not None
+            lanes.factors[k] = lane.factor
+    for k in swept:
+        if k not in lanes.factors and share[k] > EXACT:
+            lane = _Lane(lanes, k)
+            lanes.common.weight[k] = 0.0
             lane.factor_at(jones[k], None)
             assert lane.factor is not None
             lanes.factors[k] = lane.factor

@@ -132,7 +132,8 @@ class ElementBeam(JonesTerm):
 
     `jones` is as electromagnetic codes and EveryBeam give it, for fields exp(+i omega t). The fringe is of
     exp(-i omega t): a chain and a `StationBeam` take the conjugate (`in_chain`), here and nowhere else. `real` promises
-    that there is nothing to conjugate.
+    that there is nothing to conjugate. `zenith_seam` is by how much of its largest entry J at the zenith may depend
+    on the azimuth from which it is reached, where a published model leaves that: plans of directions near it say so.
     """
 
     plugin_kind: ClassVar[str | None] = "elements"
@@ -141,6 +142,7 @@ class ElementBeam(JonesTerm):
     blind_below_horizon: ClassVar[bool] = True
     real: ClassVar[bool] = False
     knob: ClassVar[Knob | None] = None
+    zenith_seam: ClassVar[float] = 0.0
 
     def in_chain(self) -> ElementBeam:
         """The element with the sign of the fringe: itself if it is real, or its conjugate."""
@@ -168,7 +170,7 @@ class Conjugate(ElementBeam):
 
     def model_post_init(self, context: Any, /) -> None:
         """Its promises are those of the element."""
-        for promise in ("maps", "structure", "per_station", "directional", "blind_below_horizon"):
+        for promise in ("maps", "structure", "per_station", "directional", "blind_below_horizon", "zenith_seam"):
             object.__setattr__(self, promise, getattr(self.element, promise))
 
     @property

@@ -16,7 +16,7 @@ from instrument.observe.observation import Observation
 from instrument.predict.direct import Direct
 from instrument.scene import Scene
 from instrument.stress.bench import field, observed, small_array
-from instrument.stress.case import Answer, both, case, claim, held, not_there
+from instrument.stress.case import Answer, Unfit, both, case, claim, held, not_there
 from instrument.units import Direction
 from instrument.visibilities import Visibilities, VisibilitySet
 
@@ -134,6 +134,114 @@ def no_memory(_: None) -> Answer:
             else:
                 left.append(f"block {k}: saved all the same")
     return claim(not left, f"left: {', '.join(left)}")
+
+
+@case(
+    "C1",
+    "visibilities",
+    "noise of 200 integrations of 1 ms",
+    "200 draws of their own; rms SEFD / sqrt(2 dnu dt), to 4 sigma",
+)
+def short_noise(_: None) -> Answer:
+    """A key of rounded times has 112; close channels have their own too; a part of it has the same noise."""
+    from astropy import units as u
+
+    data = observed(small_array(3), field(), 200, (150.0, 150.001), interval=1e-3)
+    noise = data.with_noise(1e3 * u.Jy, seed=1).data - data.data
+    distinct = len({x.tobytes() for x in noise.reshape(-1, 3, 2, 2).round(9)})
+    sigma = 1e3 / np.sqrt(2 * 0.2e6 * 1e-3)
+    part = data.block(slice(50, 60), slice(1, 2))
+    same = part.with_noise(1e3 * u.Jy, seed=1).data - part.data
+    level = np.abs(noise.real.std() / sigma - 1) * np.sqrt(2 * noise.size)
+    return both(
+        claim(distinct == 400, f"{distinct} draws of 400"), held(same, noise[50:60, 1:2], 1e-9), Answer(level, 5.0)
+    )
+
+
+@case("B3", "visibilities", "a beam taken out that is not in the data", "refused: which beam is in the data is known")
+def no_beam(_: None) -> Answer:
+    """And the one that is there comes out: a source at the centre is then as without, to 1e-10."""
+    from instrument.errors import InstrumentError
+    from instrument.jones.parallactic import Parallactic
+    from instrument.stress.bench import points
+    from instrument.stress.cases_exact import Slanted
+
+    array = Composed(stations=small_array(3), terms=(Slanted(), Parallactic()))
+    bare = Composed(stations=small_array(3))
+    sky = points([CENTRE.ra_rad], [CENTRE.dec_rad], [2, 0.3, 0.1, 0])
+    without = observed(array, sky).without_beam(array)
+    try:
+        observed(bare, sky).without_beam(array)
+        taken = True
+    except InstrumentError:
+        taken = False
+    return both(
+        held(without.data, observed(bare, sky).data, 1e-10), claim(not taken, "taken out of data that have none")
+    )
+
+
+SMALL = """name = "small"
+engine = "direct"
+[instrument]
+telescope = "lofar-hba"
+stations = ["CS001HBA0", "CS002HBA0", "CS003HBA0"]
+[observation]
+phase_centre = "08h13m36.0s +48d13m03s"
+transit = "2012-12-07"
+duration = "40 s"
+interval = "10 s"
+frequency = { centre = "150 MHz", channel_width = "0.19 MHz", channels = 1 }
+[sky]
+kind = "grid"
+shape = [1, 1]
+[image]
+pixels = 32
+pixel = "2 arcmin"
+"""
+
+
+@case("67b", "run", "no memory in a block, in an image, while files are written", "one line, status 1, and no folder")
+def run_out(_: None) -> Answer:
+    """The first call of each of these fails in a run of three stations."""
+    import contextlib
+    import io
+    import os
+    from unittest.mock import patch
+
+    from instrument.image import cube, dirty
+    from instrument.pipeline.run import run
+    from instrument.pipeline.scene_file import parse
+    from instrument.pipeline.scene_text import read_tables
+    from instrument.predict import base
+    from instrument.registry import available
+    from instrument.report import page
+    from instrument.terminal import status_of
+
+    if "lofar-hba" not in available("telescopes"):
+        raise Unfit("there is no telescope")
+    answers, was = [], os.getcwd()
+    places = ((base.Blockwise, "sums"), (dirty.Images, "add"), (dirty.Images, "finish"), (cube, "write_cube"),
+              (page, "write_page"))  # fmt: skip
+    for owner, name in places:
+        with tempfile.TemporaryDirectory() as folder:
+            os.chdir(folder)
+            Path("small.toml").write_text(SMALL, encoding="utf-8")
+            said = io.StringIO()
+            try:
+                with (
+                    patch.object(owner, name, side_effect=MemoryError("no block")),
+                    contextlib.redirect_stderr(said),
+                    contextlib.redirect_stdout(io.StringIO()),
+                ):
+                    tables = read_tables("small.toml")
+                    status = status_of(lambda t=tables: int(run(parse(t), t, "x", verify=False).passed))  # type: ignore[misc]
+                rest = sorted(str(p) for p in Path().rglob("*"))
+            finally:
+                os.chdir(was)
+        line = said.getvalue().strip()
+        good = status == 1 and rest == ["small.toml"] and "not enough memory" in line and "Traceback" not in line
+        answers.append(claim(good, f"{name}: status {status}, left {rest}, said {line[-160:]}"))
+    return both(*answers)
 
 
 MISSING = (not_there("68", "run", "GPU against CPU", "within the bound", "no engine runs on a GPU"),)

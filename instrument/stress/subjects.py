@@ -17,7 +17,8 @@ from instrument.registry import KINDS, Plugin, available, load, plugin_class
 # of plugins that have no default for them
 USUAL = {"diameter": "25 m", "height": "0.5 m", "fwhm": "10 deg", "pixels": 64, "pixel": "1 arcmin"}
 TRIED = ("engines", "elements", "telescopes", "calibrators", "imagers", "foregrounds")
-PARTS = ("jones", "visibilities", "faraday-depth", "spectra", "run")  # of the framework, which no plugin replaces
+# of the framework, which no plugin replaces
+PARTS = ("jones", "geometry", "sky", "visibilities", "photometry", "cubes", "faraday-depth", "spectra", "run")
 HELD: dict[str, type[Component]] = {
     "calibrators": Calibrator,
     "imagers": AnyImager,
