@@ -57,6 +57,7 @@ class Plan(VisibilitySet):
     bounds: tuple[Item, ...]
     scale_jy: float
     seconds: float = field(compare=False, default=0.0)  # on a machine of speed 1
+    next_decade: str = ""  # what a tenth of the tolerance would cost
     checker: Checker | None = field(compare=False, repr=False, default=None)  # sees the blocks as they pass
 
     @property
@@ -111,6 +112,8 @@ class Plan(VisibilitySet):
             f"about {spell(self.seconds / speed())}, peak {si_prefix(self.memory, 'B')} "
             f"in {count_of(len(self.slices), 'block')}"
         )
+        if self.next_decade:
+            lines.append(f"a decade more {self.next_decade}")
         lines += [f"refused       {i.name:<22} {i.reason}" for i in self.refused]
         every = (*self.kept, *self.left_out, *self.bounds, *self.not_modelled)
         inside = ", ".join(f"{i.name} {i.bound:.1e}" for i in every if i.bound)

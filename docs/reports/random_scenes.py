@@ -87,11 +87,16 @@ def scene(seed):
     pole = np.sign(latitude) * 90 if rng.random() < 0.1 else np.clip(latitude + 30 * rng.normal(), -90, 90)
     dec = float(np.clip(rng.uniform(-90, 90) if rng.random() < 0.1 else pole, -90, 90))
     centre = SkyCoord(rng.uniform(0, 360) * u.deg, dec * u.deg)
+    start = f"20{rng.integers(10, 25)}-0{rng.integers(1, 9)}-1{rng.integers(0, 9)}T{rng.integers(10, 23)}:00:00"
+    interval, count = 3000.0, int(rng.integers(1, 4))
+    other = np.random.default_rng([seed, 10])  # what is drawn above and below stays what it was
+    if other.random() < 0.4:
+        interval, count = 10 ** other.uniform(0.3, 2.3), int(other.integers(4, 40))
     observation = Observation(
         phase_centre=centre,
-        start=f"20{rng.integers(10, 25)}-0{rng.integers(1, 9)}-1{rng.integers(0, 9)}T{rng.integers(10, 23)}:00:00",
-        duration=int(rng.integers(1, 4)) * 3000 * u.s,
-        interval=3000 * u.s,
+        start=start,
+        duration=count * interval * u.s,
+        interval=interval * u.s,
         frequencies=np.unique(frequencies) * u.Hz,
         channel_width=1e3 * u.Hz,
     )

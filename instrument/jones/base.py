@@ -78,6 +78,14 @@ class JonesTerm(Component):
         """How many sines and cosines it takes for each time, channel and direction: what an engine plans with."""
         return 0
 
+    def motion(self, at: Sampling, order: int) -> tuple[Float, Float] | None:
+        """How fast the term changes as the Earth turns, if it knows: bounds that hold at any time of a sampling.
+
+        On d^n J / d angle^n for n = 0 ... order, (order + 1, S), of a smooth rotation, and on the change of J for each
+        radian of any other motion, (S,). For terms whose structure is "scalar".
+        """
+        return None
+
     def peak(self, at: Sampling) -> float:
         """A bound on the largest singular value of the term at any time, station and direction; infinity if unknown.
 

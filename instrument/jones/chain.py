@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from typing import Any, Self
@@ -17,7 +17,7 @@ from instrument.errors import BasisError
 from instrument.jones.base import JonesTerm, Simplified, Structure
 from instrument.numbers import Index
 from instrument.observe.sampling import Sampling
-from instrument.units import Complex, Int, NotNegative
+from instrument.units import Complex, Float, Int, NotNegative
 
 RANK: dict[str, int] = {"scalar": 0, "diagonal": 1, "full": 2}
 
@@ -137,11 +137,20 @@ class Chain(Component):
     def _shared_terms(self) -> list[JonesTerm]:
         return [t for t in self.parts[self._outer_count() :] if t.structure != "scalar"]
 
-    def factors(self, at: Sampling) -> Factors:
-        """The product as cheap factors; equal to `jones` (tests/accuracy/test_agreement.py)."""
+    def moving(self, at: Sampling, order: int) -> list[tuple[JonesTerm, tuple[Float, Float]]]:
+        """The scalar terms that know how fast they change, each with its `motion`."""
+        terms = [t for t in self.parts[self._outer_count() :] if t.structure == "scalar"]
+        return [(t, found) for t in terms if (found := t.motion(at, order)) is not None]
+
+    def factors(self, at: Sampling, without: Sequence[JonesTerm] = ()) -> Factors:
+        """The product as cheap factors, without some terms; equal to `jones` (tests/accuracy/test_agreement.py)."""
         split = self._outer_count()
         outer = [t.jones(at) for t in self.parts[:split]]
-        scalars = [t.scalar(at) for t in self.parts[split:] if t.structure == "scalar"]
+        scalars = [
+            t.scalar(at)
+            for t in self.parts[split:]
+            if t.structure == "scalar" and not any(t is other for other in without)
+        ]
         matrices = self._shared_terms()
         group = np.zeros(len(at.layout), int)
         where = at

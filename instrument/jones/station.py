@@ -13,6 +13,7 @@ from instrument.checked import checked
 from instrument.component import Component
 from instrument.errors import InputError
 from instrument.jones.base import Basis, ElementBeam, JonesTerm, PerStation, ScalarTerm
+from instrument.jones.motion import product, touchard
 from instrument.observe.directions import LIGHT
 from instrument.observe.sampling import Sampling
 from instrument.phasor import array_factor
@@ -66,17 +67,20 @@ class ArrayFactor(ScalarTerm):
         """The array factor (T, F, A, S)."""
         out: Any = np.ones((1, 1, 1, 1))
         times, channels, _, sources = at.shape
-        light = -LIGHT if self.phase == "fringe" else LIGHT
         for level in self.levels:
-            steer = at.pointing_itrf if level.pointing is None else at.earth.itrf(level.pointing.vector[None])[:, 0]
-            f0 = np.full(channels, self.reference_frequency) if self.reference_frequency else at.freq_hz
-            waves = (at.freq_hz[:, None, None] * at.itrf[:, None] - (f0[:, None] * steer[:, None])[:, :, None]) / light
             offsets, which = level.distinct
             if len(which) not in (1, len(at.layout)):
                 raise InputError(f"a level holds {len(which)} stations, the array has {len(at.layout)}")
-            factor = array_factor(np.swapaxes(waves, 2, 3).reshape(-1, 3, sources), offsets)
-            out = out * factor.reshape(times, channels, -1, sources)[:, :, which]
+            waves = np.swapaxes(self._waves(level, at), 2, 3).reshape(-1, 3, sources)
+            out = out * array_factor(waves, offsets).reshape(times, channels, -1, sources)[:, :, which]
         return np.asarray(out)
+
+    def _waves(self, level: Level, at: Sampling) -> Float:
+        """Cycles of phase per m of offset, (T, F, S, 3)."""
+        light = -LIGHT if self.phase == "fringe" else LIGHT
+        steer = at.pointing_itrf if level.pointing is None else at.earth.itrf(level.pointing.vector[None])[:, 0]
+        f0 = np.full(at.shape[1], self.reference_frequency) if self.reference_frequency else at.freq_hz
+        return (at.freq_hz[:, None, None] * at.itrf[:, None] - (f0[:, None] * steer[:, None])[:, :, None]) / light
 
     def phasors(self) -> int:
         """One for each part of every different layout, level by level."""
@@ -85,6 +89,23 @@ class ArrayFactor(ScalarTerm):
     def peak(self, at: Sampling) -> float:
         """1: a mean of unit vectors."""
         return 1.0
+
+    def motion(self, at: Sampling, order: int) -> tuple[Float, Float] | None:
+        """Phases turn with offset and direction across the axis of the Earth; none for directions of other frames."""
+        if at.seen is not None or at.seen_centre is not None:
+            return None
+        powers = np.arange(order + 1)[:, None]
+        derivatives, per_rad = np.where(powers == 0, 1.0, np.zeros(at.shape[3])), np.zeros(at.shape[3])
+        for level in self.levels:
+            waves = 2 * np.pi * self._waves(level, at.some(np.arange(1)))[0]  # at any time of this length
+            whole = np.linalg.norm(waves, axis=-1)
+            # 1e-3: precession in four years, aberration
+            across = (np.linalg.norm(waves[..., :2], axis=-1) * 1.001 + 1e-3 * whole).max(axis=0)
+            offsets = level.distinct[0]
+            moments = (np.linalg.norm(offsets[..., :2], axis=-1) ** powers[..., None]).mean(axis=2).max(axis=1)
+            derivatives = product(derivatives, touchard(order, moments[:, None] * across**powers))
+            per_rad += whole.max(axis=0) * np.linalg.norm(offsets, axis=-1).mean(axis=1).max()
+        return derivatives, per_rad
 
     def rounding(self, at: Sampling) -> Float:
         """That of the phases of the outermost parts, and of the mean."""

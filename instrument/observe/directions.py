@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from instrument.errors import InputError, warn
-from instrument.units import Direction, Float
+from instrument.units import Direction, Float, Int
 
 LIGHT = 299792458.0
 EARTH_RATE = 7.292115855306589e-5  # rad/s, IAU
@@ -28,7 +28,7 @@ class EarthFrame:
     matrices: Float
     velocity: Float
 
-    def __getitem__(self, times: slice) -> EarthFrame:
+    def __getitem__(self, times: slice | Int) -> EarthFrame:
         return EarthFrame(self.matrices[times], self.velocity[times])
 
     def __len__(self) -> int:

@@ -13,7 +13,7 @@ from instrument.errors import InputError
 from instrument.observe.directions import EarthFrame, earth_frame, lmn, tangents
 from instrument.observe.layout import Layout
 from instrument.shown import short_repr
-from instrument.units import Direction, Float, instants, plain, unit_vectors
+from instrument.units import Direction, Float, Int, instants, plain, unit_vectors
 
 
 class Rising(NamedTuple):
@@ -85,11 +85,17 @@ class Sampling:
     @checked
     def block(self, times: slice, channels: slice) -> Sampling:
         """The same for some times and channels."""
+        return replace(self._with_times(times), freq_hz=self.freq_hz[channels])
+
+    def some(self, which: Int) -> Sampling:
+        """The same for some times, by their indices."""
+        return self._with_times(which)
+
+    def _with_times(self, times: Any) -> Sampling:
         return replace(
             self,
             earth=self.earth[times],
             slots_s=self.slots_s[times],
-            freq_hz=self.freq_hz[channels],
             seen=None if self.seen is None else self.seen[times],
             seen_east=None if self.seen_east is None else self.seen_east[times],
             seen_centre=None if self.seen_centre is None else self.seen_centre[times],

@@ -19,13 +19,22 @@ from instrument.visibilities import Visibilities
 STATIONS, INTEGRATIONS = 12, 3
 FULL = tuple(10.0 ** (-k / 4) for k in range(5, 45))
 SHORT = tuple(10.0**-k for k in range(2, 12))
+FEW = tuple(10.0**-k for k in range(2, 12, 3))  # of patterns beside "full"
+PATTERNS = {  # errors that a pattern has the unknowns for
+    "full": Chain(GainTerm(rms=0.1, seed=1), FeedTerm(rms=0.1, seed=2)),
+    "diagonal": Chain(GainTerm(rms=0.1, seed=1)),
+}
 STEPS = 10.0  # a step of the size of the tolerance is left where a solve stops; more than ten of them is wrong
 
 
 def contests(calibrators: dict[str, Any], form: Form) -> list[Contest]:
-    """One with errors of gains and feeds of 0.1, without noise, seen through element, tile and station beams."""
+    """One for each pattern of unknowns, errors of 0.1, no noise, seen through element, tile and station beams."""
     sky = _sky()
-    data = sky.corrupted(Chain(GainTerm(rms=0.1, seed=1), FeedTerm(rms=0.1, seed=2)))
+    return [_of_pattern(pattern, calibrators, sky, form) for pattern in PATTERNS]
+
+
+def _of_pattern(pattern: str, calibrators: dict[str, Any], sky: Visibilities, form: Form) -> Contest:
+    data = sky.corrupted(PATTERNS[pattern])
     scale = _rms(sky.data)
 
     def judge(solution: Any, asked: float) -> Trial:
@@ -37,29 +46,30 @@ def contests(calibrators: dict[str, Any], form: Form) -> list[Contest]:
         ended = RIGHT if whole else Outcome.ITERATION_LIMIT.name
         return Trial(error, leaked, WRONG if whole and not error <= STEPS * asked else ended)
 
-    return [
-        Contest(
-            name="calibrate through beams",
-            kind="calibrators",
-            knob="tolerance",
-            values=SHORT if form.quick else FULL,
-            entries=tuple(Entry(name, _answer(cls, data, sky)) for name, cls in calibrators.items()),
-            judge=judge,
-            error="rms of the corrected data less the model, over the rms of the model",
-            error_user="rms of what is wrong in Q and U, over the rms of the model",
-            truth="the model itself, of which the data were made with known matrices",
-        )
-    ]
+    # a solver that has no pattern of unknowns of its own stands beside those of full matrices alone
+    entries = {n: c for n, c in calibrators.items() if pattern == "full" or "pattern" in c.model_fields}
+    values = FULL if not form.quick else SHORT if pattern == "full" else FEW
+    return Contest(
+        name="calibrate through beams" + ("" if pattern == "full" else f", {pattern} errors"),
+        kind="calibrators",
+        knob="tolerance",
+        values=values,
+        entries=tuple(Entry(name, _answer(cls, data, sky, pattern)) for name, cls in entries.items()),
+        judge=judge,
+        error="rms of the corrected data less the model, over the rms of the model",
+        error_user="rms of what is wrong in Q and U, over the rms of the model",
+        truth="the model itself, of which the data were made with known matrices",
+    )
 
 
-def _answer(cls: Any, data: Visibilities, sky: Visibilities) -> Any:
+def _answer(cls: Any, data: Visibilities, sky: Visibilities, pattern: str) -> Any:
     from instrument.calibrate.directional import DirectionalCal
 
     def answer(tolerance: float) -> Any:
-        solver = cls(tolerance=tolerance)
-        return (
-            solver.solve(data, {"all": sky})["all"] if isinstance(solver, DirectionalCal) else solver.solve(data, sky)
-        )
+        solver = cls(tolerance=tolerance, **({} if pattern == "full" else {"pattern": pattern}))
+        if isinstance(solver, DirectionalCal):
+            return solver.solve(data, {"all": sky})["all"]
+        return solver.solve(data, sky)
 
     return answer
 

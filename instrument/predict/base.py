@@ -129,6 +129,7 @@ class Prepared(ABC):
     problem: Problem
     bound: float = 0.0
     atom: tuple[int, int] = (1, 1)
+    omission: tuple[str, str] = ("", "")  # what the bound is of, and how it is left out, for a plan to say
 
     @abstractmethod
     def sums(self, times: slice, channels: slice, pairs: tuple[Int, Int] | None = None) -> Complex:
@@ -160,12 +161,16 @@ class Blockwise(Prepared):
         given = self.block(times, channels, pairs)
         turned = given.antenna1 > given.antenna2
         if not turned.any():
-            return self.engine.sums(given)
+            return self.summed(given)
         # V_ba is V_ab^H to the last bit: the order of products is that of one of them
         a, b = (pick(given.antenna1, given.antenna2) for pick in (np.minimum, np.maximum))
-        out = self.engine.sums(given.between(a, b))
+        out = self.summed(given.between(a, b))
         out[:, :, turned] = mat2.herm(out[:, :, turned])
         return out
+
+    def summed(self, given: Problem) -> Complex:
+        """Visibilities in Jy, complex (T, F, B, 2, 2), of a block."""
+        return self.engine.sums(given)
 
     def task(self, times: slice, channels: slice) -> Callable[[], Visibilities]:
         """The engine and the block alone."""

@@ -17,11 +17,13 @@ from instrument.compiled import compiled
 from instrument.jones.chain import Factors
 from instrument.observe.directions import LIGHT
 from instrument.phasor import FAST, station_phases
-from instrument.predict.base import Predictor, Problem, Work
+from instrument.predict.base import Predictor, Prepared, Problem, Work
+from instrument.predict.time_nodes import EXACT
+from instrument.predict.within import WHOLE, Way, quickest
 from instrument.sky.points import points_of
 from instrument.units import Complex, Int
 
-FEW = 6  # groups of stations up to which products are made per pair of groups
+FEW = 6  # groups of stations up to which products are made per pair of groups, and in 32 bit where that is allowed
 
 
 class Matrix(Predictor):
@@ -31,7 +33,11 @@ class Matrix(Predictor):
         """Refuses skies that are not lists of sources."""
         return None if problem.sky.kind == "points" else "the sky is not a list of sources"
 
-    def work(self, problem: Problem) -> Work:
+    def prepare(self, problem: Problem, tolerance: float) -> Prepared:
+        """With a tolerance, array factors at few integrations and products of 32 bit, where that is quicker."""
+        return quickest(self, problem, tolerance)
+
+    def work(self, problem: Problem, way: Way = WHOLE) -> Work:
         """8 operations for each pair of stations, source and product (1 to 4 of them), and the beams before."""
         times, channels, _ = problem.shape
         stations, sources = problem.at.shape[2:]
@@ -41,10 +47,13 @@ class Matrix(Predictor):
         gemm = 8.0 * slots * sources * stations**2 * products
         parts = sum(term.phasors() for term in problem.chain.parts)
         # 40 operations for each sine and cosine (2.3 ns), 600 for each shared 2x2 matrix and source (250 ns)
-        phasors = float(slots * sources * (stations + parts))
+        phasors = float(slots * sources * (stations + parts * way.panels.share))
         matrices = float(slots * sources * shares)
-        flops = gemm + 40 * phasors + 600 * matrices
-        seconds = gemm / 25e9 + 2.5e-9 * phasors + 4e-7 * matrices + 4e-9 * slots * sources * stations
+        between = 4.0 * slots * sources * stations * way.panels.between
+        flops = gemm + 40 * phasors + 600 * matrices + between
+        seconds = gemm / 25e9 + 4e-7 * matrices + (2.5e-9 + 4e-9) * slots * sources * stations
+        seconds -= 0.5 * gemm / 25e9 if way.single else 0.0
+        seconds += slots * sources * way.panels.seconds(parts, stations)
         seconds += 4e-7 * slots * len(problem.antenna1)  # sorting products into baselines
         scalars = 16 * stations * sources
         shared = 64 * shares * sources * (8 if shares <= FEW else 4)
@@ -52,13 +61,16 @@ class Matrix(Predictor):
         held = slots * (3.2 * scalars + shared + wide + 24 * 8 * sources + 64 * 2.1 * len(problem.antenna1))
         return Work(flops, 0.0, held, seconds)
 
-    def sums(self, problem: Problem) -> Complex:
+    def sums(self, problem: Problem, way: Way = WHOLE) -> Complex:
         """Visibilities in Jy, complex (T, F, B, 2, 2)."""
         at = problem.at
         times, channels, stations, sources = at.shape
         uvw = at.uvw_m[:, None] * (at.freq_hz[:, None, None] / LIGHT)
         z = station_phases(uvw.reshape(-1, stations, 3), at.lmn).reshape(times, channels, stations, sources)
-        factors = problem.chain.factors(at)
+        moving = [] if way.panels == EXACT else [term for term, _ in problem.chain.moving(at, 0)]
+        if moving:
+            way.panels.multiply(z, at, moving)
+        factors = problem.chain.factors(at, moving)
         if factors.scalar is not None:
             z *= factors.scalar
         sky = np.broadcast_to(problem.sky.brightness(at), (times, channels, sources, 2, 2))
@@ -68,7 +80,7 @@ class Matrix(Predictor):
         points, shaped = np.flatnonzero(~listed.gaussian), np.flatnonzero(listed.gaussian)
         if len(points):
             whole = len(points) == sources
-            _point_sums(problem, factors, z, sky, slice(None) if whole else points, out)
+            _point_sums(problem, factors, z, sky, slice(None) if whole else points, out, way.single)
         if len(shaped):
             axes = listed.shape_axes(at.centre)[shaped]
             _gaussian_sums(problem, factors, z[..., shaped], sky[:, :, shaped], shaped, axes, uvw, out)
@@ -91,7 +103,9 @@ def _products(problem: Problem, shares: int) -> float:
     return 8
 
 
-def _point_sums(problem: Problem, factors: Factors, z: Complex, sky: Complex, rows: Any, out: Complex) -> None:
+def _point_sums(
+    problem: Problem, factors: Factors, z: Complex, sky: Complex, rows: Any, out: Complex, single: bool
+) -> None:
     times, channels, stations, _ = z.shape
     if not isinstance(rows, slice):
         z, sky = np.ascontiguousarray(z[..., rows]), sky[:, :, rows]
@@ -104,36 +118,39 @@ def _point_sums(problem: Problem, factors: Factors, z: Complex, sky: Complex, ro
         assert m is not None
         _wide(problem, z, mat2.mul(m, sky[:, :, None]), m, out)
         return
-    members = [np.flatnonzero(factors.group == g) for g in range(groups)]
-    full = np.empty((stations, stations, 2, 2), complex)
-    for g, of_g in enumerate(members):
+    # stations of a group side by side, so that products are of slices
+    order = np.argsort(factors.group, kind="stable")
+    place = np.argsort(order)
+    index = place[problem.antenna1] * stations + place[problem.antenna2]
+    ends = np.searchsorted(factors.group[order], np.arange(groups + 1))
+    z = z if groups == 1 else z[:, :, order]
+    blocks: list[Any] = []
+    for g in range(groups):
         for h in range(g, groups):
-            of_h = members[h]
             c = sky if m is None else mat2.mul(mat2.mul(m[:, :, g], sky), mat2.herm(m[:, :, h]))
-            wanted = _entries(c, same=g == h)
-            # baselines of these two groups, in either order of their stations
-            forward = np.flatnonzero(np.isin(problem.antenna1, of_g) & np.isin(problem.antenna2, of_h))
-            back = np.flatnonzero(np.isin(problem.antenna1, of_h) & np.isin(problem.antenna2, of_g))
-            if g == h:
-                back = back[:0]
-            block: Any = np.ix_(of_g, of_h)
-            for t in range(times):
-                for f in range(channels):
-                    zg = z[t, f] if groups == 1 else z[t, f, of_g]
-                    zh = zg if g == h else z[t, f, of_h]
-                    right = zh.conj().T
-                    for i, j, source in wanted:
-                        if source is None:
-                            full[(*block, i, j)] = (zg * c[t, f, :, i, j]) @ right
-                        elif source == (i, j):
-                            full[(*block, i, j)] = 0.0
-                        elif source == (j, i) and i != j:  # C is Hermitian, so this product is the other one's
-                            full[(*block, i, j)] = full[(*block, j, i)].conj().T
-                        else:
-                            full[(*block, i, j)] = full[(*block, *source)]
-                    out[t, f, forward] += full[problem.antenna1[forward], problem.antenna2[forward]]
-                    if len(back):  # V_ab = V_ba^H
-                        out[t, f, back] += mat2.herm(full[problem.antenna2[back], problem.antenna1[back]])
+            span = slice(ends[g], ends[g + 1]), slice(ends[h], ends[h + 1])
+            blocks.append((span, _entries(c, same=g == h), np.ascontiguousarray(np.moveaxis(c, (3, 4), (0, 1)))))
+    size = np.float64(1.0)
+    if single:  # no flux is too large or too small for 32 bit
+        size = np.float64(max(np.abs(c).max() for _, _, c in blocks))
+        z, blocks = z.astype(np.complex64), [(*block, (c / size).astype(np.complex64)) for *block, c in blocks]
+    full = np.zeros((2, 2, stations, stations), z.dtype)
+    found = np.empty((4, len(index)), z.dtype)
+    for t in range(times):
+        for f in range(channels):
+            right = z[t, f].conj().T
+            for (of_g, of_h), wanted, c in blocks:
+                for i, j, source in wanted:
+                    if source is None:
+                        np.matmul(z[t, f, of_g] * c[i, j, t, f], right[:, of_h], out=full[i, j, of_g, of_h])
+                    elif source == (j, i) and i != j:  # C is Hermitian, so this product is the other one's
+                        full[i, j, of_g, of_h] = full[j, i, of_g, of_h].conj().T
+                    elif source != (i, j):  # else it is zero, and stays it
+                        full[i, j, of_g, of_h] = full[(*source, of_g, of_h)]
+                if of_g != of_h:  # V_ab = V_ba^H
+                    full[:, :, of_h, of_g] = full[:, :, of_g, of_h].conj().transpose(1, 0, 3, 2)
+            np.take(full.reshape(4, -1), index, axis=1, out=found)
+            out[t, f] += (size * found if single else found).T.reshape(-1, 2, 2)
 
 
 def _entries(c: Complex, same: bool) -> list[tuple[int, int, tuple[int, int] | None]]:

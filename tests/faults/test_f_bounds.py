@@ -28,6 +28,7 @@ from instrument import (
     Scene,
     StationBeam,
 )
+from instrument.errors import RefusedError
 from instrument.jones.base import Simplified
 from instrument.observe.directions import offset
 from instrument.precision.truth import visibilities
@@ -252,20 +253,21 @@ SAMPLE = (9, 17, 34, 43, 50, 59, 67, 82, 90, 99)
 def test_f3_random_scenes_keep_their_bound(reports, seed):
     """A few of the 500 of docs/reports/bounds.py."""
     found = reports("bounds").one(seed)
-    if found is None:
+    if found in ("nothing rises", "the floor"):
         return
     assert found["error"] <= found["bound"]
     assert found["verified"]
-    assert found["said"] or not found["exceeded"]
+    assert not found["exceeded"]
 
 
 @pytest.mark.long
 def test_f3_random_scenes_keep_their_bound_all_of_them(reports):
     one = reports("bounds").one
-    found = [r for r in map(one, range(300)) if r is not None]
-    assert len(found) > 150
+    found = [r for r in map(one, range(300)) if r not in ("nothing rises", "the floor")]
+    assert len(found) > 130
+    assert sum(r["sampled"] for r in found) > 10
     assert [r for r in found if r["error"] > r["bound"] or not r["verified"]] == []
-    assert [r for r in found if r["exceeded"] and not r["said"]] == []
+    assert [r for r in found if r["exceeded"]] == []
 
 
 # F4: squares that are no floats -------------------------------------------------------------------------------------
@@ -297,21 +299,21 @@ def test_f4_a_gain_whose_square_overflows_has_no_bound_and_says_so():
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.9, 1.1, 1.5, 2.0, 3.0, 10.0])
-def test_f5_the_bounds_sum_to_less_than_the_tolerance_or_it_is_said(factor):
+def test_f5_the_bounds_sum_to_less_than_the_tolerance_or_it_is_refused(factor):
     rng = np.random.default_rng(3)
     flux = 10.0 ** rng.uniform(-13, 0, 40)[:, None] * np.array([1, 0.3, 0.2, 0.1])
     made = scene(PointSky.at(near(rng.uniform(-0.05, 0.05, (40, 2))), flux))
     tolerance = factor * made.plan().error_bound
+    if factor < 1:
+        with pytest.raises(RefusedError, match="below what float64 can promise"):
+            made.plan(tolerance=tolerance)
+        return
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         plan = made.plan(tolerance=tolerance)
-    if factor < 1:
-        assert "below what float64 can promise" in str(said[0].message)
-        assert "ABOVE the tolerance" in str(plan)
-    else:
-        assert plan.error_bound <= tolerance
-        assert not said
-        assert "ABOVE" not in str(plan)
+    assert plan.error_bound <= tolerance
+    assert not said
+    assert "ABOVE" not in str(plan)
 
 
 @pytest.mark.parametrize("tolerance", [np.nan, np.inf, -1e-3, 1.0, 2.0, "1e-3", True, None])

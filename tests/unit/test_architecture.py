@@ -43,6 +43,7 @@ LAYERS = (
     ("check",),
     ("plan",),
     ("not_modelled",),
+    ("omissions",),
     ("planner",),
     ("scene",),
     ("calibrate",),
