@@ -110,7 +110,7 @@ def _next_decade(full: Problem, tolerance: float, rounded: float, engine: str | 
     if rounded > tolerance / 10:
         return f"no decade more: float64 promises {rounded:.1e} here"
     more = _decided(full, tolerance / 10, rounded, engine).ready.work().seconds / max(seconds, 1e-12)
-    return f"tolerance {tolerance / 10:g} would take {more:.2g} times as long"
+    return f"tolerance {tolerance / 10:g} would take {more:.2f} times as long"
 
 
 def _as_given(instrument: Instrument, sky: Sky, observation: Observation) -> Problem:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from instrument.errors import InputError, warn
+from instrument.observe.orientation import orientation_table
 from instrument.units import Direction, Float, Int
 
 LIGHT = 299792458.0
@@ -80,10 +81,10 @@ def earth_frame(times: Any, site_m: Float) -> EarthFrame:
 
     times = times.utc
     with iers.conf.set_temp("auto_download", False), iers.conf.set_temp("auto_max_age", None):
-        table = iers.earth_orientation_table.get()
+        table = orientation_table()
         jd1, jd2 = np.atleast_1d(times.jd1), np.atleast_1d(times.jd2)
         ut1_utc, status = table.ut1_utc(jd1, jd2, return_status=True)
-        pole_x, pole_y = table.pm_xy(jd1, jd2)
+        pole_x, pole_y, _ = table.pm_xy(jd1, jd2, return_status=True)
     outside = np.asarray(status) < 0
     if outside.any():
         warn(

@@ -93,5 +93,4 @@ def _single(problem: Problem, peak: float, share: Float) -> float:
 
 def _said(way: Way, names: str) -> tuple[str, str]:
     sampled = f"{names} at {way.panels.nodes} of {way.panels.size} times" if way.panels != EXACT else ""
-    single = "products in 32 bit" if way.single else ""
-    return "exact sums", "; ".join(filter(None, (sampled and f"{sampled}, polynomials between", single)))
+    return "exact sums", ", ".join(filter(None, (sampled, "32-bit products" if way.single else "")))
