@@ -23,7 +23,7 @@ from instrument.units import Float
 from instrument.visibilities import Visibilities
 
 IMAGERS, FARADAY, SPECTRA = ("ducc0",), ("rm-tools", "rm-lite"), ("ps_eor",)
-ACCURACIES = tuple(10.0**-k for k in range(3, 13))
+MOST = 100_000  # iterations of RM-CLEAN
 WINDOWS = {None: "boxcar", "hann": "hann", "blackman-harris": "blackmanharris"}  # ours: those of ps_eor
 
 
@@ -80,7 +80,7 @@ def synthesis_peers(cube: StokesCube, depths: Float) -> list[Entry]:
     """RM-Tools by the accuracy of its transforms, in the precision that has it; rm-lite the same."""
     q, v = (np.ascontiguousarray(cube.data[:, k]) for k in (1, 2))
     lambda2 = (LIGHT / cube.freq_hz) ** 2
-    found = []
+    found, accuracies = [], tuple(10.0**-k for k in (3, 5, 6, 8, 10, 12))
     if find_spec("RMutils"):
         from RMutils.util_RM import do_rmsynth_planes
 
@@ -88,9 +88,9 @@ def synthesis_peers(cube: StokesCube, depths: Float) -> list[Entry]:
             bits = 32 if asked >= 1e-7 else 64
             return do_rmsynth_planes(q, v, lambda2, depths, nBits=bits, eps=asked, log=_nothing).FDFcube
 
-        found.append(_entry("RM-Tools (eps)", tools, ACCURACIES))
+        found.append(_entry("RM-Tools (eps)", tools, accuracies))
     if find_spec("rm_lite"):
-        found.append(_entry("rm-lite (eps)", _rm_lite_synthesis(q, v, lambda2, depths), ACCURACIES))
+        found.append(_entry("rm-lite (eps)", _rm_lite_synthesis(q, v, lambda2, depths), accuracies))
     return found
 
 
@@ -98,29 +98,36 @@ def _rm_lite_synthesis(q: Float, v: Float, lambda2: Float, depths: Float) -> Cal
     from rm_lite.utils.synthesis import rmsynth_nufft
 
     def answer(asked: float) -> Any:
-        return rmsynth_nufft(q + 1j * v, lambda2, depths, np.ones(len(lambda2)), float(lambda2.mean()), eps=asked)
+        p = (q + 1j * v).astype(np.complex64 if asked >= 1e-7 else np.complex128, copy=False)
+        return rmsynth_nufft(p, lambda2, depths, np.ones(len(lambda2)), float(lambda2.mean()), eps=asked, nthreads=1)
 
     return answer
 
 
 def clean_peers(dirty: Any, gain: float) -> list[Entry]:
     """RM-Tools and rm-lite by the cutoff, on the same dirty spectra."""
-    found = []
-    step = dirty.depths[1] - dirty.depths[0]
-    wide = step * np.arange(1 - len(dirty.depths), len(dirty.depths))
-    shape = dirty.data.shape[1:]
+    found, cutoffs = [], tuple(10.0**-k for k in range(1, 6))
+    many, shape = len(dirty.depths), dirty.data.shape[1:]
+    wide = (dirty.depths[1] - dirty.depths[0]) * np.arange(-many, many + 1)
     rmsf = np.repeat(dirty.rmsf_at(wide)[:, None], np.prod(shape), axis=1).reshape(len(wide), *shape)
+    fwhm = np.full(shape, dirty.fwhm)
     if find_spec("RMutils"):
         from RMutils.util_RM import do_rmclean_hogbom
 
         def tools(asked: float) -> Any:
-            fwhm = np.full(shape, dirty.fwhm)
-            made = do_rmclean_hogbom(
-                dirty.data, dirty.depths, rmsf, wide, fwhm, asked, 100_000, gain, nBits=64, window=asked, log=_nothing
-            )
-            return made.ccArr, RIGHT
+            given = dirty.data, dirty.depths, rmsf, wide, fwhm, asked, MOST, gain
+            return do_rmclean_hogbom(*given, nBits=64, window=asked, log=_nothing).ccArr, RIGHT
 
-        found.append(_entry("RM-Tools (cutoff)", tools, tuple(10.0**-k for k in (1, 2, 3))))
+        found.append(_entry("RM-Tools (cutoff)", tools, cutoffs))
+    if find_spec("rm_lite"):
+        from rm_lite.utils.clean import RMCleanOptions, RMSynthArrays, rmclean
+
+        def lite(asked: float) -> Any:
+            arrays = RMSynthArrays(dirty.data, dirty.depths, wide, rmsf, fwhm[None])
+            options = RMCleanOptions(mask=asked, threshold=asked, max_iter=MOST, gain=gain)
+            return rmclean(arrays, options).model_fdf_arr, RIGHT
+
+        found.append(_entry("rm-lite (cutoff)", lite, cutoffs))
     return found
 
 
