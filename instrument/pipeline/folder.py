@@ -11,6 +11,7 @@ import shutil
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from instrument.errors import InputError, warn
 
@@ -137,11 +138,21 @@ def _written_here(folder: Path) -> bool:
     for name in OURS:
         try:
             file = folder / name
-            if file.is_file() and file.stat().st_size < MOST_BYTES and "versions" in json.loads(file.read_bytes()):
+            if file.is_file() and file.stat().st_size < MOST_BYTES and "versions" in _record(file):
                 return True
         except (OSError, ValueError, TypeError, RecursionError):
             continue
     return False
+
+
+def _record(file: Path) -> Any:
+    """What a file records: that of JSON, or the keys of what stands before an ECSV table."""
+    if file.suffix == ".json":
+        return json.loads(file.read_bytes())
+    first, *lines = file.read_text(encoding="utf-8").splitlines()
+    if not first.startswith("# %ECSV"):
+        return {}
+    return {line.lstrip("# -").partition(":")[0] for line in lines if line.startswith("#")}
 
 
 def clean(folder: Path) -> list[str]:

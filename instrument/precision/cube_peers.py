@@ -106,7 +106,7 @@ def _rm_lite_synthesis(q: Float, v: Float, lambda2: Float, depths: Float) -> Cal
 
 def clean_peers(dirty: Any, gain: float) -> list[Entry]:
     """RM-Tools and rm-lite by the cutoff, on the same dirty spectra."""
-    found, cutoffs = [], tuple(10.0**-k for k in range(1, 6))
+    found, cutoffs = [], tuple(10.0**-k for k in (1, 2, 3, 4))
     many, shape = len(dirty.depths), dirty.data.shape[1:]
     wide = (dirty.depths[1] - dirty.depths[0]) * np.arange(-many, many + 1)
     rmsf = np.repeat(dirty.rmsf_at(wide)[:, None], np.prod(shape), axis=1).reshape(len(wide), *shape)
@@ -123,7 +123,7 @@ def clean_peers(dirty: Any, gain: float) -> list[Entry]:
         from rm_lite.utils.clean import RMCleanOptions, RMSynthArrays, rmclean
 
         def lite(asked: float) -> Any:
-            arrays = RMSynthArrays(dirty.data, dirty.depths, wide, rmsf, fwhm[None])
+            arrays = RMSynthArrays(dirty.data, dirty.depths, wide, rmsf, np.array(dirty.fwhm))
             options = RMCleanOptions(mask=asked, threshold=asked, max_iter=MOST, gain=gain)
             return rmclean(arrays, options).model_fdf_arr, RIGHT
 

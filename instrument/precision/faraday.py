@@ -17,7 +17,7 @@ from instrument.precision.truth import LIGHT, cis, real
 from instrument.units import Complex, Float
 
 SIDES = (48, 8, 256)  # pixels along a side: of the quick form, and of the full one
-SIDES_CLEAN = (8, 2, 32)
+SIDES_CLEAN = (8, 2, 16)
 FREQ = 134e6 + 0.2e6 * np.arange(161)
 DEPTHS = np.linspace(-50, 50, 401)
 # what Analyzer.rm_synthesis promises, of the largest |F|

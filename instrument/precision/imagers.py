@@ -18,7 +18,7 @@ from instrument.units import Float, Int
 from instrument.visibilities import Visibilities
 
 # stations, integrations, pixels
-SIZES = ((20, 10, 128), (20, 40, 256), (48, 40, 1024))
+SIZES = ((20, 10, 128), (40, 20, 512))
 FULL = tuple(10.0 ** (-k / 8) for k in range(16, 97))  # eight a decade, 1e-2 to 1e-12
 SHORT = tuple(10.0**-k for k in range(2, 13))
 ACROSS = 17  # pixels along a side at which the truth is worked out, both ends among them
@@ -50,7 +50,7 @@ def contest(imagers: dict[str, Any], stations: int, times: int, pixels: int, for
     common = {"pixels": pixels, "pixel": pixel * u.rad}
     entries = [Entry(name, _answer(cls, data, common), _values(cls)) for name, cls in imagers.items()]
     if form.peers:
-        entries += imager_peers(data, pixels, pixel, SHORT if form.quick else FULL)
+        entries += imager_peers(data, pixels, pixel, SHORT)
     return Contest(
         name=f"image {pixels} x {pixels} pixels",
         kind="imagers",

@@ -84,6 +84,7 @@ def test_a_table_a_figure_and_a_page_are_written(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "p" / "precision.png").stat().st_size > 10000
     page = (tmp_path / "p" / "precision.html").read_text()
     assert "instrument precision engines --quick" in page and "its bound is 1e-3: the floor" in page
+    assert main(["precision", "engines", "--quick", "--out", str(tmp_path / "p"), "--force"]) == 0  # replaces its own
     said = capsys.readouterr().out
     assert "halves: for an error of 1e-06" not in said and "take good, tolerance" in said
 
