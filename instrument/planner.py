@@ -109,7 +109,10 @@ def _next_decade(full: Problem, tolerance: float, rounded: float, engine: str | 
         return ""
     if rounded > tolerance / 10:
         return f"no decade more: float64 promises {rounded:.1e} here"
-    more = _decided(full, tolerance / 10, rounded, engine).ready.work().seconds / max(seconds, 1e-12)
+    try:
+        more = _decided(full, tolerance / 10, rounded, engine).ready.work().seconds / max(seconds, 1e-12)
+    except RefusedError as error:
+        return f"no decade more: {error}"
     return f"tolerance {tolerance / 10:g} would take {more:.2f} times as long"
 
 
