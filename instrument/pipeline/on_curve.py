@@ -51,10 +51,10 @@ def _alike(record: Mapping[str, Any]) -> bool:
 @cache
 def curves() -> dict[str, Any]:
     """Rows (engine, asked, seconds a visibility, error) of scenes that were measured, by name; "meta" says how."""
-    from astropy.table import QTable
+    from astropy.table import Table
 
     path = files("instrument.data") / "precision_engines.ecsv"
-    table = QTable.read(path, format="ascii.ecsv")
+    table = Table.read(path, format="ascii.ecsv")
     found: dict[str, Any] = {"meta": table.meta}
     for scene, *row in table.iterrows("scene", "engine", "asked", "seconds_each", "error"):
         found.setdefault(str(scene), []).append(tuple(row))

@@ -132,3 +132,13 @@ def test_solvers_that_say_converged_are_right():
     for entry in one.entries:
         for asked in one.values:
             assert one.judge(entry.answer(asked), asked).outcome == "right"
+
+
+def test_a_run_is_drawn_on_the_curves_that_come_along():
+    from instrument.pipeline.on_curve import curves
+    from instrument.report.precision import point_figure
+
+    rows = curves()["mock-grid"]
+    assert all(isinstance(row[0], str) and all(isinstance(x, float) for x in row[1:]) for row in map(tuple, rows))
+    (axes,) = point_figure(rows, "matrix", 1e-6, (1e-14, 1e-10)).axes
+    assert {text.get_text() for text in axes.get_legend().get_texts()} >= {"matrix", "direct", "this run (matrix)"}
