@@ -12,7 +12,7 @@ from instrument.precision.truth import visibilities
 from instrument.scene import Scene
 from instrument.units import Complex
 
-STATIONS, TIMES, CHANNELS = 12, 6, 2  # of which the truth is worked out: 66 baselines
+STATIONS, TIMES, CHANNELS = 12, 32, 1  # of which the truth is worked out: 66 baselines
 FULL = tuple(10.0 ** (-k / 8) for k in range(16, 97))  # eight a decade, 1e-2 to 1e-12
 SHORT = tuple(10.0**-k for k in range(2, 13))
 
