@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from instrument.jones.base import ElementBeam
 from instrument.observe.directions import EarthFrame
 from instrument.observe.layout import Layout
 from instrument.observe.sampling import Sampling
+from instrument.precision import peers
 from instrument.precision.contest import UNSET, Contest, Entry, Form, Trial
 from instrument.precision.truth import geometry, has_truth, matrix, of_term, product
 from instrument.registry import names, plugin_class
@@ -101,16 +103,20 @@ def _sampled(name: str, cls: Any, form: Form) -> Contest:
 
         return answer
 
+    entries = [
+        Entry(name, formula, (0.0,)),
+        Entry(f"{name}, table, linear", table(1)),
+        Entry(f"{name}, table, cubic", table(3)),
+    ]
+    if form.peers and name == "hamaker":
+        entries += peers.hamaker(within(ready()[0]), angle, azimuth)
     return Contest(
         name=f"element {name}, {count} directions",
         kind="elements",
         knob="spacing of the table, deg",
         values=SPACINGS[1::2] if form.quick else SPACINGS,
-        entries=(
-            Entry(name, formula, (0.0,)),
-            Entry(f"{name}, table, linear", table(1)),
-            Entry(f"{name}, table, cubic", table(3)),
-        ),
+        entries=tuple(entries),
+        peers=peers.EVERYBEAM if name == "hamaker" else (),
         judge=lambda found, asked: distance(found, state["truth"]),
         error=f"largest error of a matrix within {STEEPEST:g} deg of the zenith, over the largest matrix",
         error_user="rms error of the intrinsic leakage, 1/sqrt(IXR)",
@@ -175,11 +181,15 @@ def _stand_in(band: str, elements: dict[str, Any], form: Form) -> Contest:
     truth = differential(truth_of(lofar, at))
 
     def entry(name: str, cls: Any) -> Entry:
-        def answer(asked: float) -> Complex:
-            element = made(cls, band, asked)
-            if turns(element, within(lofar)):
+        @cache
+        def element(asked: float) -> ElementBeam:
+            one: ElementBeam = made(cls, band, asked)
+            if turns(one, within(lofar)):
                 raise RefusedError("its receptors turn with their mount, LOFAR's stand still: it is another antenna")
-            return np.broadcast_to(element.jones(at), (*at.shape, 2, 2))[0, 0, 0]
+            return one
+
+        def answer(asked: float) -> Complex:
+            return np.broadcast_to(element(asked).jones(at), (*at.shape, 2, 2))[0, 0, 0]
 
         values = (UNSET,) if cls.knob is None else cls.knob[2]
         label = name if cls.knob is None else f"{name} ({cls.knob[0]}{', ' * bool(cls.knob[1])}{cls.knob[1]})"

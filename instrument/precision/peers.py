@@ -53,6 +53,15 @@ def _everybeam() -> Any:
 # EveryBeam ---------------------------------------------------------------------------------------------------------
 
 
+def hamaker(freq_hz: float, angle: Float, azimuth: Float) -> list[Entry]:
+    """EveryBeam's polynomials of the high band, (S, 2, 2); angles count from its X dipole, in the south-west."""
+    if find_spec("everybeam") is None:
+        return []
+    element = _everybeam().ElementResponse.create("hamaker", "HBA")
+    freq, phi = np.full(len(angle), freq_hz), azimuth - np.deg2rad(225)
+    return [Entry("everybeam", lambda asked: element.response(freq, angle, phi), (0.0,), peer=True)]
+
+
 def station_beams(telescope: Instrument, at: Sampling, shared: Callable[[float], Any]) -> list[Entry]:
     """EveryBeam on a data set made of the same stations; `shared(held)` gives the times asked and which is whose.
 
@@ -124,7 +133,7 @@ def _matvis(problem: Problem, given: dict[str, Any], asked: float) -> Complex:
     from matvis import simulate_vis
     from pyuvdata.analytic_beam import UniformBeam
 
-    pairs = list(zip(problem.antenna1.tolist(), problem.antenna2.tolist(), strict=True))
+    pairs = np.stack([problem.antenna1, problem.antenna2], axis=-1)
     found = simulate_vis(
         **given, beams=[UniformBeam()], precision=1 if asked > 1e-7 else 2, polarized=False, antpairs=pairs,
         coord_method="CoordinateRotationERFA",

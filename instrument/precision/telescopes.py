@@ -70,7 +70,7 @@ def _of(name: str, cls: Any, form: Form) -> Contest:
 
     def judge(found: Any, asked: float) -> Trial:
         if isinstance(found, peers.Horizon):
-            centre, jones = (x.astype(np.clongdouble) for x in found)
+            jones, centre = (x.astype(np.clongdouble) for x in found)
             return distance(product(inverse(centre), jones), alone())
         return distance(found, truth)
 
