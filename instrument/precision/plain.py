@@ -20,6 +20,7 @@ from instrument.scene import Scene
 
 SOURCES, TIMES = ((300,), (300, 3000, 30000)), 4
 BASELINES = 60  # of which the truth is worked out
+SUPERTERP = tuple(f"CS00{k}" for k in range(2, 8))
 SIDE, PITCH = 10, 14.6  # stations along a side of the lattice, m between them: the distance of HERA's dishes
 
 
@@ -30,10 +31,11 @@ def contests(engines: Mapping[str, Any], form: Form) -> list[Contest]:
 
 
 def arrays() -> dict[str, Layout]:
-    """LOFAR's 48 core fields, and a square lattice at their place."""
+    """LOFAR's 48 core fields, the 12 of its superterp, 300 m across, and a square lattice at their place."""
     lofar = registry.load("telescopes", "lofar-hba", beam=None).layout()
     core = lofar.select([name for name in lofar.names if name.startswith("CS")])
-    return {"LOFAR's core": core, f"a lattice of {SIDE} x {SIDE}": lattice(core)}
+    superterp = core.select([name for name in core.names if name[:5] in SUPERTERP])
+    return {"LOFAR's core": core, "LOFAR's superterp": superterp, f"a lattice of {SIDE} x {SIDE}": lattice(core)}
 
 
 def lattice(near: Layout) -> Layout:
@@ -59,7 +61,7 @@ def contest(name: str, layout: Layout, count: int, engines: Mapping[str, Any], f
     scene = Scene(name=name, instrument=Composed(stations=layout), sky=sky, observation=night)
     plan = scene.plan()
     full, scale = plan.full, plan.scale_jy
-    chosen = np.random.default_rng(4).choice(len(full.antenna1), BASELINES, replace=False)
+    chosen = np.random.default_rng(4).choice(len(full.antenna1), min(BASELINES, len(full.antenna1)), replace=False)
     few = full.between(full.antenna1[chosen], full.antenna2[chosen])
     truth = visibilities(few)
     drifting: Any = peers.drifting_truth(few) if form.peers and find_spec("matvis") is not None else None
@@ -88,7 +90,7 @@ def contest(name: str, layout: Layout, count: int, engines: Mapping[str, Any], f
         values=SHORT[::2] if form.quick else FULL[::2],
         entries=tuple(entries),
         judge=judge,
-        error=f"largest error of a visibility of {BASELINES} of {len(full.antenna1)} baselines, over the total flux",
+        error=f"largest error of a visibility of {len(chosen)} of {len(full.antenna1)} baselines, over the total flux",
         error_user="rms error of a visibility, over the total flux",
         truth="the direct sum in extended precision; for programs without phase centre towards their directions",
     )

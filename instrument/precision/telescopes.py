@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -16,10 +17,11 @@ from instrument.observe.sampling import Sampling
 from instrument.precision import peers
 from instrument.precision.contest import Contest, Entry, Form, Trial
 from instrument.precision.elements import distance, inverse, within
-from instrument.precision.truth import chain_jones, geometry, has_truth, product
+from instrument.precision.truth import chain_jones, geometry, has_truth, parallactic, product
 from instrument.units import Complex, Direction
 
-STATIONS, DIRECTIONS, TIMES = 12, (25, 100), 60
+STATIONS, JUDGED = 12, 25  # stations and directions of which the truth is worked out
+DIRECTIONS, TIMES = (100, 400), 60
 START, STEP = "2012-12-07T01:00:00", 60.0  # s between times
 HELD = tuple(STEP * n for n in (1, 2, 3, 5, 10, 20, 30, 60))  # s for which a beam is held
 FIELD = 0.09  # rad: half a side of the field
@@ -60,19 +62,27 @@ def where(telescope: Instrument, count: int) -> tuple[Any, Any, Any, Any]:
 
 
 def _of(name: str, cls: Any, form: Form) -> Contest:
-    telescope = small(cls)
+    telescope, few = cls(), small(cls)
     count = DIRECTIONS[0] if form.quick else DIRECTIONS[1]
     directions, times, freq, centre = where(telescope, count)
-    at = telescope.sampling(directions, times, freq, centre)
-    truth = _truth(telescope, at)
+    whole = telescope.sampling(directions, times, freq, centre)
+    # the Earth moves as at the centre of the whole array
+    at = replace(whole, layout=few.layout()).towards(whole.ra_rad[:JUDGED], whole.dec_rad[:JUDGED])
+    truth = _truth(few, at)
+    stations = [telescope.layout().index(name) for name in few.layout().names]
 
-    alone = cache(lambda: _truth(telescope, at, sky=False).conj())  # EveryBeam has the other sign of time
+    @cache
+    def rotation() -> tuple[Any, Any]:
+        """From north and east into the axes of the antennas, towards the directions and the pointing."""
+        return tuple(parallactic(None, a, geometry(a)) for a in (at, at.at_centre()))
 
     def judge(found: Any, asked: float) -> Trial:
-        if isinstance(found, peers.Horizon):
-            jones, centre = (x.astype(np.clongdouble) for x in found)
-            return distance(product(inverse(centre), jones), alone())
-        return distance(found, truth)
+        if not isinstance(found, peers.Horizon):
+            return distance(found[:, :, stations, :JUDGED], truth)
+        jones = found.jones[:, :, stations, :JUDGED].astype(np.clongdouble)
+        to, middle = (r[found.times] for r in rotation())
+        beam = product(found.centre[:, :, stations].astype(np.clongdouble), middle)
+        return distance(product(inverse(beam), product(jones, to)), truth.conj())
 
     def entry(label: str, one: Instrument) -> Entry:
         def answer(held: float) -> Complex:
@@ -84,25 +94,20 @@ def _of(name: str, cls: Any, form: Form) -> Contest:
 
         return Entry(label, answer)
 
-    entries = [entry(name, telescope)]
-    entries += [
-        entry(f"{name}, {field} {value}", small(cls, **{field: value}))
-        for field, value in VARIANTS.items()
-        if field in cls.model_fields
-    ]
+    variants = {field: value for field, value in VARIANTS.items() if field in cls.model_fields}
+    entries = [entry(name, telescope), *(entry(f"{name}, {k} {v}", cls(**{k: v})) for k, v in variants.items())]
     if form.peers and name in peers.LOFAR:
-        entries += peers.station_beams(telescope, at, shared)
-    stations = len(telescope.layout())
+        entries += peers.station_beams(telescope, whole, shared)
     return Contest(
-        name=f"beam of {name}, {TIMES * stations * count} station matrices",
+        name=f"beam of {name}, {TIMES * len(telescope.layout()) * count} station matrices",
         kind="telescopes",
         knob="held, s",
         values=HELD[::2] if form.quick else HELD,
         entries=tuple(entries),
         judge=judge,
         peers=peers.EVERYBEAM if name in peers.LOFAR else (),
-        error=f"largest error of a differential matrix over the largest, {stations} stations, {TIMES} min, "
-        f"{2 * np.rad2deg(FIELD):.0f} deg",
+        error=f"largest error of a differential matrix over the largest, {len(stations)} of the stations, {JUDGED} "
+        f"directions within {2 * np.rad2deg(FIELD):.0f} deg, {TIMES} min",
         error_user="rms error of the intrinsic leakage, 1/sqrt(IXR)",
         truth="the sum over all parts of a station, times the element, in extended precision",
     )
@@ -115,15 +120,11 @@ def shared(held: float) -> tuple[Any, Any]:
     return np.unique(np.minimum(np.arange(TIMES) // steps * steps + steps // 2, TIMES - 1), return_inverse=True)
 
 
-def _truth(telescope: Instrument, at: Sampling, sky: bool = True) -> Any:
-    """Differential matrices (T, F, A, S, 2, 2) in extended precision, or `None` where a term has no formula there.
-
-    Not in the basis of the `sky` but in that of the antennas, without the last rotation.
-    """
+def _truth(telescope: Instrument, at: Sampling) -> Any:
+    """Differential matrices (T, F, A, S, 2, 2) in extended precision, or `None` where a term has no formula there."""
     chain, _ = telescope.chain().simplified(at)
     if not all(map(has_truth, chain.terms)):
         return None
-    terms = chain.terms if sky else tuple(term for term in chain.terms if term.maps[0] != "sky")
     both = (at, at.at_centre())
-    found, middle = (np.broadcast_to(chain_jones(terms, a, geometry(a)), (*a.shape, 2, 2)) for a in both)
+    found, middle = (np.broadcast_to(chain_jones(chain.terms, a, geometry(a)), (*a.shape, 2, 2)) for a in both)
     return product(inverse(middle), found)

@@ -19,7 +19,8 @@ def few(monkeypatch):
     """Contests on few directions, stations and times: what is looked at is the machinery."""
     monkeypatch.setattr("instrument.precision.elements.DIRECTIONS", (60, 60))
     monkeypatch.setattr("instrument.precision.elements.SPACINGS", (15.0, 7.5, 5.0, 3.0))
-    monkeypatch.setattr("instrument.precision.telescopes.DIRECTIONS", (3, 3))
+    monkeypatch.setattr("instrument.precision.telescopes.DIRECTIONS", (4, 4))
+    monkeypatch.setattr("instrument.precision.telescopes.JUDGED", 3)
     monkeypatch.setattr("instrument.precision.telescopes.STATIONS", 3)
     monkeypatch.setattr("instrument.precision.telescopes.TIMES", 12)
 

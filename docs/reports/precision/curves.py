@@ -33,7 +33,8 @@ def main():
                 rows.append((scene, row["plugin"], float(f"{row['asked']:.3g}"), each, float(f"{row['error']:.2g}")))
     found = QTable(rows=rows, names=("scene", "engine", "asked", "seconds_each", "error"))
     found["seconds_each"] = found["seconds_each"] * u.s
-    found.meta = {key: table.meta[key] for key in ("made", "versions", "machine")}
+    found.meta = {key: table.meta[key] for key in ("made", "versions")}
+    found.meta["machine"] = table.meta["machine"]["processor"]
     found.meta["command"] = "instrument precision engines" + " --quick" * ("--quick" in table.meta["command"])
     OUT.unlink(missing_ok=True)
     write_ecsv(found, OUT)
