@@ -14,6 +14,7 @@ from instrument.pipeline.scene_text import read_tables, shipped
 from instrument.pipeline.work import PREDICT
 from instrument.report.page import Figures, Section
 
+PLAN = "plan"
 ALIKE = ("instrument", "sky")  # tables that must be those of the shipped scene: cost and error hang on them
 
 
@@ -27,14 +28,15 @@ def on_curve(record: Mapping[str, Any], draw: Callable[..., Any]) -> list[Sectio
     if rows is None or not seen or not check.get("passed") or not error or not np.isfinite(error) or not _alike(record):
         return []
     count = math.prod(seen[axis][1] for axis in ("times", "channels", "baselines"))
-    seconds = record["stages"][PREDICT]["seconds"]["measured"] / count
+    steps = record["stages"]
+    seconds = sum(steps[name]["seconds"]["measured"] for name in (PLAN, PREDICT) if name in steps) / count
     if not seconds > 0:
         return []
     meta = curves()["meta"]
     text = (
-        "Error of the prediction against seconds a visibility: this run (star; its error as the check found it, its "
-        f"bound above), and the engines as `{meta['command']}` measured them on {meta['made'][:10]} "
-        f"({meta['machine']}); beside a mark what was asked."
+        "Error of the prediction against seconds a visibility, its plan included: this run (star; its error as the "
+        f"check found it, its bound above), and the engines on six integrations, as `{meta['command']}` measured them "
+        f"on {meta['made'][:10]} ({meta['machine']}); beside a mark what was asked."
     )
     figure = point_figure(rows, record["plan"]["engine"], seconds, (error, check["bound"]))
     return [Section("Error against run time", [Figures([draw("precision", figure, text)])])]

@@ -8,8 +8,11 @@ from instrument.cli import main
 from instrument.errors import RefusedError
 from instrument.jones.base import ElementBeam
 from instrument.jones.mueller import ixr_jones
+from instrument.pipeline.on_curve import on_curve
+from instrument.pipeline.scene_text import read_tables
 from instrument.precision import Form, contests_of, elements
 from instrument.precision.elements import differential, distance, leakage
+from instrument.report.style import drawer
 
 QUICK = Form(quick=True)
 
@@ -122,3 +125,26 @@ def test_beams_of_stations_are_right_to_rounding_and_change_while_they_are_held(
     assert rows["lofar-hba", 60.0].error < 1e-11  # phases of 100 turns
     assert rows["lofar-hba", 180.0].error > 1e-5 and rows["lofar-hba", 600.0].error > 2 * rows["lofar-hba", 180.0].error
     assert 1e-5 < rows["lofar-hba, tiles ideal", 60.0].error < 1e-2
+
+
+def test_the_page_of_a_run_has_its_point_on_the_curve_of_its_scene(tmp_path):
+    tables = read_tables("mock-grid")
+    check = {"error": 3e-13, "bound": 1e-10, "passed": True, "seen": {"times": [3, 6], "channels": [1, 1]}}
+    check["seen"] |= {"baselines": [1711, 1711], "stations": [59, 59]}
+    record = {
+        "name": "mock-grid", "scene": tables, "plan": {"engine": "matrix"}, "checks": {"prediction": check},
+        "stages": {name: {"seconds": {"measured": 0.2}} for name in ("plan", "predict")},
+    }  # fmt: skip
+    (section,) = on_curve(record, drawer(tmp_path))
+    assert section.title == "Error against run time" and (tmp_path / "precision.png").stat().st_size > 10000
+    other = record | {"scene": tables | {"sky": tables["sky"] | {"flux": "1 Jy"}}}
+    unchecked = record | {"checks": {"prediction": check | {"passed": None, "error": None}}}
+    for without in (other, unchecked, record | {"name": "mine"}):
+        assert on_curve(without, drawer(tmp_path)) == []
+
+
+@pytest.mark.long
+def test_the_run_of_a_scene_is_right_to_rounding_where_little_is_allowed():
+    (run,) = [c for c in contests_of("mock-grid", ("matrix",), QUICK) if c.name == "run mock-grid"]
+    rows = told(run)
+    assert rows["matrix", 1e-6].error < 1e-6 and rows["matrix", 1e-6].error < rows["matrix", 1e-2].error < 1e-2
