@@ -12,7 +12,7 @@ from instrument.errors import InstrumentWarning
 from instrument.foreground.loss import signal_loss
 from instrument.image.cube import StokesCube
 from instrument.image.mocks import FINE, leaked, noise_cube, polarized_screens
-from instrument.precision.contest import Contest, Entry, Form, Trial
+from instrument.precision.contest import RIGHT, Contest, Entry, Form, Trial
 
 PIXELS = (48, 96)  # of the quick form and of the full one
 LEAKED, NOISE = 7.1e-3, 10e-3  # K, rms of a voxel in Stokes I
@@ -43,10 +43,12 @@ def contests(removers: dict[str, Any], form: Form) -> list[Contest]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", InstrumentWarning)
             score = split.score(foreground=truth).value
-            kept, _ = signal_loss(split.remover, cube, signal).within((0.06, 1.0), (0.02, 0.5))
-        return Trial(
-            float(score), float(abs(1 - kept)), "right" if split.outcome.name == "CONVERGED" else split.outcome.name
-        )
+            loss = signal_loss(split.remover, cube, signal)
+        kept, _ = loss.within((0.06, 1.0), (0.02, 0.5))
+        across, along = (loss.k_perp >= 0.02) & (loss.k_perp < 0.5), (loss.k_par >= 0.06) & (loss.k_par < 1)
+        worst = float(np.nanmax(np.abs(1 - loss.transfer[np.ix_(across, along)])))
+        ended = RIGHT if split.outcome.name == "CONVERGED" else split.outcome.name
+        return Trial(float(score), float(abs(1 - kept)), ended, worst)
 
     return [
         Contest(

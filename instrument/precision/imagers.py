@@ -18,7 +18,7 @@ from instrument.units import Float, Int
 from instrument.visibilities import Visibilities
 
 # stations, integrations, pixels
-SIZES = ((20, 10, 128), (40, 20, 512))
+SIZES = ((20, 10, 128), (24, 40, 512))
 FULL = tuple(10.0 ** (-k / 8) for k in range(16, 97))  # eight a decade, 1e-2 to 1e-12
 SHORT = tuple(10.0**-k for k in range(2, 13))
 ACROSS = 17  # pixels along a side at which the truth is worked out, both ends among them

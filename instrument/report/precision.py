@@ -18,8 +18,10 @@ MARKS = "osD^vP*Xh"
 
 
 @styled
-def precision_figure(contests: Sequence[tuple[Any, Sequence[Any], Sequence[Any]]]) -> Figure:
-    """A row of panels for each contest, given as (contest, rows, rows of the Pareto front)."""
+def precision_figure(
+    contests: Sequence[tuple[Any, Sequence[Any], Sequence[Any]]], seconds: str = "wall seconds"
+) -> Figure:
+    """A row of panels for each contest, given as (contest, rows, rows of the Pareto front); what `seconds` are of."""
     figure = Figure(figsize=(15.5, 5.4 * len(contests)), layout="constrained")
     panels = figure.subplots(len(contests), 3, squeeze=False)
     for axes, (contest, rows, front) in zip(panels, contests, strict=True):
@@ -27,6 +29,8 @@ def precision_figure(contests: Sequence[tuple[Any, Sequence[Any], Sequence[Any]]
         _against_seconds(axes[1], contest, rows, (), "error_user")
         _asked_and_got(axes[2], contest, rows)
         axes[0].set_title(contest.name, loc="left", fontweight="bold")
+        for ax in axes[:2]:
+            ax.set_xlabel(seconds)
         axes[0].legend(loc="best", fontsize=10, frameon=False)
     return figure
 
