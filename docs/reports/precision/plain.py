@@ -29,8 +29,9 @@ ASKED, ERRORS = (1e-4, 1e-8), (1e-3, 1e-7)  # a peer may exceed what it was aske
 WHY = (
     "Why, as far as it was looked into: matvis does the same product of matrices, for one receptor and without phase",
     "centre, and plans nothing; ours plans anew every time, and 30 sources take it 0.09 s. Beside other work on the",
-    "machine (load above 1) differences below 20 % are none. On a lattice fftvis needs one transform in two dimensions of the grid of",
-    "baselines, whatever their number; where stations lie in no plane it takes one in three, and falls far behind.",
+    "machine (load above 1) differences below 20 % are none. On a lattice fftvis needs one transform in two dimensions",
+    "of the grid of baselines, whatever their number; where stations lie in no plane it takes one in three, and falls",
+    "far behind.",
 )
 PROGRAMS = ("matrix", "matvis", "fftvis")
 
