@@ -34,7 +34,7 @@ JOBS = {
     "rm-synthesis": lambda: [faraday._synthesis(side, FORM) for side in (8, 48, 160)],
     "rm-clean": lambda: [faraday._clean(side, FORM) for side in (2, 8)],
     "spectra": lambda: [
-        make(FORM, *size) for make in (spectra._floor, spectra._known) for size in ((64, 32), (192, 96))
+        make(FORM, *size) for make in (spectra._floor, spectra._known) for size in ((64, 32), (96, 64))
     ],
 }
 WHY = {
