@@ -4,11 +4,14 @@
 
 Places are drawn by a seed (mutant_sites.py). The cases run on the copy in an order that begins with those that enter
 the mutated function, as a run without mutants has shown; the first that finds the mutant ends the run. Found is: a case
-comes out WRONG that was not, or is no longer right; or the program breaks or does not end. All cases are tried before a
-mutant is said to have survived. Compiled loops are compiled anew where the mutant may be in them. Writes mutants.md.
+comes out WRONG that was not, or is no longer right; or the program breaks or does not end. All cases that enter any
+function of the file are tried before a mutant is said to have survived. Compiled loops are compiled anew where the
+mutant may be in them. Writes mutants.md.
 """
 
 import argparse
+import hashlib
+import importlib
 import json
 import os
 import platform
@@ -50,23 +53,33 @@ def place(file: str) -> str:
 
 
 def child(order: str) -> None:
-    """Try cases in an order (JSON: key and subject of each, all where it is empty), a line of JSON for each."""
-    from instrument.stress.case import judged
+    """Try cases in an order (JSON: key and subject of each), a line of JSON for each; "watched", with what they enter.
+
+    Without an order: one line of the cases that there are, and of the module of each.
+    """
+    from instrument.stress import MODULES
+    from instrument.stress.case import cases_of, judged
     from instrument.stress.subjects import subjects
     from instrument.stress.suite import all_cases, trials
 
     todo = {(c.key, s.name): (c, s) for c, s in trials(subjects(None), all_cases()) if c.tried and not s.trouble}
-    wanted = [tuple(x) for x in json.loads(order)]
+    given = json.loads(order)
+    if not given:
+        home = {c.key: m for m in MODULES for c in cases_of(importlib.import_module(f"instrument.stress.{m}"))}
+        print(json.dumps([[*name, home[name[0]]] for name in todo]), flush=True)
+        return
+    watched = given[0] == "watched"
+    wanted = [tuple(x) for x in given[watched:]]
     entered: set[tuple[str, str]] = set()
 
     def note(frame, event, _):
         if event == "call":
             entered.add((frame.f_code.co_filename, frame.f_code.co_qualname))
 
-    for name in wanted or list(todo):
+    for name in wanted:
         entered.clear()
         begin = time.perf_counter()
-        if not wanted:
+        if watched:
             threading.setprofile(note)
             sys.setprofile(note)
         given, subject = todo[name]
@@ -75,7 +88,7 @@ def child(order: str) -> None:
         threading.setprofile(None)
         calls = sorted({f"{place(f)}:{q.replace('<locals>.', '')}" for f, q in entered if "/tree/" in f})
         seconds = time.perf_counter() - begin
-        print(json.dumps([*name, row.verdict, row.remark, seconds, [] if wanted else calls]), flush=True)
+        print(json.dumps([*name, row.verdict, row.remark, seconds, calls if watched else []]), flush=True)
 
 
 class Copy:
@@ -83,6 +96,8 @@ class Copy:
 
     def __init__(self, folder: Path) -> None:
         self.tree, self.base, self.fresh = folder / "tree", folder / "cache", folder / "fresh"
+        for old in (self.tree, folder / "clean"):
+            shutil.rmtree(old, ignore_errors=True)
         for source, name in PLACES.items():
             shutil.copytree(ROOT / source, self.tree / name, ignore=shutil.ignore_patterns("__pycache__"))
         shutil.copytree(self.tree, folder / "clean")
@@ -96,8 +111,8 @@ class Copy:
     def run(self, order: list, cache: Path, most: float):
         """Lines of the child, parsed, as they come; a process that is silent for `most` seconds is ended."""
         code = f"import sys; sys.path.insert(0, {str(HERE)!r}); import mutants; mutants.child(sys.stdin.read())"
-        env = dict(os.environ, PYTHONPATH=str(self.tree), NUMBA_CACHE_DIR=str(cache), OMP_NUM_THREADS="1",
-                   OPENBLAS_NUM_THREADS="1", **({"PYTHONDONTWRITEBYTECODE": "1"} if order else {}))  # fmt: skip
+        env = dict(os.environ, PYTHONPATH=str(self.tree), NUMBA_CACHE_DIR=str(cache), OMP_NUM_THREADS="1")
+        env |= {"OPENBLAS_NUM_THREADS": "1"} | ({} if order[:1] == ["watched"] else {"PYTHONDONTWRITEBYTECODE": "1"})
         with tempfile.TemporaryDirectory() as here:
             process = subprocess.Popen(
                 [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
@@ -134,12 +149,20 @@ class Copy:
         users = {place(str(p)) for p in self.tree.rglob("*.py") if f"from {module} import" in p.read_text()}
         return any(call.split(":")[0] in users for call in calls)
 
+    @staticmethod
+    def same_file(path: Path, calls: list[str]) -> bool:
+        """Whether calls enter any function of a file: others cannot see a mutant in it."""
+        return any(call.startswith(f"{place(str(path))}:") for call in calls)
+
     def tried(self, site: Site, usual: dict, most: float) -> Found:
         """A mutant put in, tried, and taken out again."""
         path, begin = self.path(site), time.perf_counter()
         spoilt = site.applied((self.clean / path.relative_to(self.tree)).read_bytes())
         entering = [k for k, (_, _, calls) in usual.items() if self.entered(path, site.function, calls)]
-        order = sorted(usual, key=lambda k: (k not in entering, usual[k][1]))
+        near = [
+            k for k, (_, _, calls) in usual.items() if k in entering or self.same_file(path, calls) or not site.function
+        ]
+        order = sorted(near, key=lambda k: (k not in entering, usual[k][1]))
         cache = self.base
         if not site.function or path in self.compiled:  # a constant may be in compiled loops elsewhere
             shutil.rmtree(self.fresh, ignore_errors=True)
@@ -168,13 +191,29 @@ class Copy:
         return "", ""
 
 
+def digest(paths: list[Path]) -> str:
+    """Of the contents of files."""
+    return hashlib.sha256(b"".join(p.read_bytes() for p in sorted(paths))).hexdigest()
+
+
 def usual(copy: Copy) -> dict:
-    """Verdict, seconds and functions entered of each case without a mutant."""
-    for _ in copy.run([], copy.base, 600):  # compiles, and fills caches that would hide who enters what
-        pass
-    found = {(k, n): (verdict, seconds, calls) for k, n, verdict, _, seconds, calls in copy.run([], copy.base, 600)}
+    """Verdict, seconds and functions entered of each case without a mutant; of a folder that is kept, what is known."""
+    kept, stress = copy.tree.parent / "usual.json", copy.clean / "instrument" / "stress"
+    own = set(stress.glob("cases_*.py"))
+    package = digest([p for p in copy.clean.rglob("*.py") if p not in own])
+    ((*cases,),) = list(copy.run([], copy.base, 600))
+    marks = {m: package + digest([stress / f"{m}.py"]) for m in {m for _, _, m in cases}}
+    known = json.loads(kept.read_text()) if kept.exists() else []
+    found = {(k, n): (v, s, c) for k, n, m, mark, v, s, c in known if marks.get(m) == mark and [k, n, m] in cases}
+    todo = ["watched", *((k, n) for k, n, _ in cases if (k, n) not in found)]
+    if len(todo) > 1:
+        for _ in copy.run(todo, copy.base, 600):  # compiles, and fills caches that would hide who enters what
+            pass
+        found |= {(k, n): (v, s, c) for k, n, v, _, s, c in copy.run(todo, copy.base, 600)}
     if wrong := [k for k, (verdict, _, _) in found.items() if verdict in ("WRONG", "ended")]:
         print(f"WRONG without a mutant, and so of no use: {wrong}")
+    home = {(k, n): m for k, n, m in cases}
+    kept.write_text(json.dumps([[*key, home[key], marks[home[key]], *found[key]] for key in found if key in home]))
     return found
 
 
@@ -237,13 +276,16 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=None, help="only so many of them")
     parser.add_argument("--only", default="", help="numbers of the table, with commas")
     parser.add_argument("--out", type=Path, default=HERE)
+    parser.add_argument("--folder", type=Path, default=None, help="kept, so that the next call need not begin anew")
     given = parser.parse_args()
     every, results = sites(), {}
     with tempfile.TemporaryDirectory() as folder:
-        copy = Copy(Path(folder))
+        copy = Copy(given.folder or Path(folder))
         begin = time.perf_counter()
         before = usual(copy)
         print(f"{len(before)} cases, twice in {time.perf_counter() - begin:.0f} s", flush=True)
+        kept = given.folder / "found.json" if given.folder else None
+        done = json.loads(kept.read_text()) if kept and kept.exists() else {}
         most = 60 + 10 * max(seconds for _, seconds, _ in before.values())
         for seed in map(int, given.seeds.split(",")):
             results[seed] = []
@@ -251,8 +293,12 @@ def main() -> None:
             for k, site in chosen:
                 if given.only and k not in map(int, given.only.split(",")):
                     continue
-                found = copy.tried(site, before, most)
+                found = done.get(f"{seed}|{key(site)}|{site.nth}|{digest([copy.path(site)])}")
+                found = Found(site, *found) if found and found[0] else copy.tried(site, before, most)
                 results[seed].append(found)
+                done[f"{seed}|{key(site)}|{site.nth}|{digest([copy.path(site)])}"] = found[1:]
+                if given.folder:
+                    (given.folder / "found.json").write_text(json.dumps(done))
                 print(f"{seed}/{k} {found.seconds:.0f} s {site.path}:{site.line} {site.function} [{site.kind}] "
                       f"{flat(site.before, 40)} -> {flat(site.after, 40)} | {found.case or 'SURVIVED'} | "
                       f"{found.entering} enter | {flat(found.how)}", flush=True)  # fmt: skip

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 
 from instrument import mat2
 from instrument.conformance.bench import problems
+from instrument.errors import InputError
 from instrument.jones.feed import FeedTerm
 from instrument.jones.gain import GainTerm
 from instrument.predict.base import EVERY, Predictor, Problem
@@ -95,6 +98,42 @@ def scaled(engine: Predictor) -> Answer:
         answers.append(held(found * 2.0**-power, plain, 0.0))
     tiny = sums(engine, problem(uvw, points(ra, 0.0, flux * 1e-310)))
     return both(*answers, held(tiny * 1e300 * 1e10, plain, 1e-12))
+
+
+@case(
+    "8b",
+    "engines",
+    "fluxes whose sum overflows; subnormal fluxes, timed",
+    "no finite sum, a plan refuses; less than 3 times as long",
+)
+def overflowing(engine: Predictor) -> Answer:
+    """Four of 1e308 Jy in one place; 300 sources of 1e-310 Jy beside 300 of 1 Jy, the best of seven."""
+    from instrument.stress.bench import observed, small_array
+
+    most = np.outer([1e308] * 4, JY)
+    with np.errstate(all="ignore"):
+        found = sums(engine, problem([(100, 30, 5), (0, 0, 0)], points([0.01] * 4, 0.0, most)))
+    try:
+        observed(small_array(2), points([2.15] * 4, [0.84] * 4, most), 1)
+        refused = False
+    except InputError:
+        refused = True
+    rng = np.random.default_rng(3)
+    uvw, ra = rng.uniform(-300, 300, (12, 3)), rng.uniform(-0.1, 0.1, 300)
+    spent = []
+    for scale in (1.0, 1e-310):
+        given = problem(uvw, points(ra, 0.0, np.outer(np.full(300, scale), [1, 0.3, -0.2, 0.1])))
+        runs = []
+        for _ in range(7):
+            begin = time.perf_counter()
+            sums(engine, given)
+            runs.append(time.perf_counter() - begin)
+        spent.append(min(runs))
+    whole = not np.isfinite(found[..., 0, 0]).any()
+    ratio = spent[1] / spent[0]
+    return claim(
+        whole and refused and ratio < 3, f"finite {not whole}, planned {not refused}, {ratio:.1f} times as long"
+    )
 
 
 @case("9", "engines", "P > I = 0, and negative Stokes", "B exp(-2 pi i u l), to 1e-13: no root of B")

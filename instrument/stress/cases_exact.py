@@ -21,7 +21,7 @@ from instrument.precision import truth
 from instrument.predict.base import Predictor, Problem
 from instrument.sky.points import PointSky
 from instrument.stress.bench import small_array, sums, towards
-from instrument.stress.case import Answer, Unfit, both, case, held
+from instrument.stress.case import Answer, Unfit, both, case, claim, held
 from instrument.units import Complex, Direction
 
 CENTRE = Direction(2.15, 0.84)
@@ -199,3 +199,42 @@ def whole_chain(telescope: Instrument) -> Answer:
         due = truth.product(due, one.conj() if isinstance(term, ElementBeam) else one)
     found = telescope.beam(away, when, [freq, 1.1 * freq] * u.Hz, centre)
     return held(found, np.broadcast_to(due, found.shape).astype(complex), 1e-10)
+
+
+@case(
+    "X4",
+    "telescopes",
+    "where the parts of phased stations stand",
+    "about their centre, in the plane, not upon each other",
+)
+def parts(telescope: Instrument) -> Answer:
+    """Sums over all levels: no two nearer than within one; a lattice that stands for a survey is within 5 cm of it."""
+    from scipy.spatial import KDTree
+
+    stations = [t for t in telescope.chain().terms if isinstance(t, StationBeam) and t.levels]
+    if not stations:
+        raise Unfit("its stations are not phased")
+    layout, answers = telescope.layout(), []
+    offsets = [np.asarray(level.offsets_m) for level in stations[0].levels]
+    for each in offsets:
+        extent = np.sqrt((each**2).sum(axis=2).mean(axis=1))
+        up = np.abs(np.einsum("amc,ac->am", each, np.broadcast_to(layout.axes[:, 2], (len(each), 3)))).max(axis=1)
+        middle = np.linalg.norm(each.mean(axis=1), axis=1)
+        answers.append(claim(bool((middle < 0.2 * extent).all()), f"centred to {(middle / extent).max():.2g}"))
+        answers.append(claim(bool((up < 0.02 * extent + 0.3).all()), f"up to {up.max():.2g} m above the plane"))
+    for a in range(0, len(layout), 7):
+        whole, least = np.zeros((1, 3)), np.inf
+        for each in offsets:
+            mine = each[a if len(each) > 1 else 0]
+            least = min(least, float(KDTree(mine).query(mine, k=2)[0][:, 1].min()))
+            whole = (whole[:, None] + mine).reshape(-1, 3)
+        apart = float(KDTree(whole).query(whole, k=2)[0][:, 1].min())
+        answers.append(
+            claim(apart > 0.95 * least, f"{layout.names[a]}: parts {apart:.2g} m apart, within one {least:.2g}")
+        )
+    if {"tiles", "tile_offsets"} <= set(dir(type(telescope))) | set(type(telescope).model_fields):
+        made: Any = telescope.with_fields(tiles="ideal")
+        lattice = np.asarray(made.chain().terms[-2].levels[0].offsets_m)
+        # the survey lists tiles row by row, as the lattice does
+        answers.append(Answer(float(np.abs(lattice - offsets[0]).max()), 0.05, graded=False))
+    return both(*answers)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from instrument.errors import Outcome
+from instrument.errors import InputError, Outcome
 from instrument.foreground.base import ForegroundRemover
 from instrument.foreground.loss import signal_loss
 from instrument.foreground.maps import Usable
@@ -142,3 +142,41 @@ def bright(remover: ForegroundRemover) -> Answer:
     elsewhere[4, 5] = False
     due, found = (float(_plane(remover, m)[:, elsewhere].std()) for m in (maps, spoilt))
     return Answer(max(found / due - 1, 0.0), 0.1, condition=1e15)
+
+
+@case(
+    "FR5", "foregrounds", "a signal that is white along frequency", "0.85 to 1.05 of it comes through beyond 0.15 /Mpc"
+)
+def eaten(remover: ForegroundRemover) -> Answer:
+    """A hundredth of the foreground; noise of a thousandth: no smooth foreground reaches so far."""
+    maps = _takes_smooth(remover)
+    signal = np.random.default_rng(5).normal(0, 1e-2, maps.shape)
+    loss = signal_loss(remover, _cube(remover, maps), _cube(remover, signal))
+    transfer, _ = loss.within((0.15, 1e3))
+    return claim(0.85 < transfer < 1.05, f"transfer {transfer:.3f}", f"transfer {transfer:.3f}")
+
+
+@case(
+    "FR6",
+    "foregrounds",
+    "a pixel of NaN, a channel of NaN, voxels beyond 1e200",
+    "NaN there, the rest as ever; refused",
+)
+def holes(remover: ForegroundRemover) -> Answer:
+    """The pixel and the channel cut out change what is left elsewhere by less than the noise."""
+    maps = _smooth() + _noise(1e-3)
+    spoilt = maps.copy()
+    spoilt[:, 3, 4] = np.nan
+    spoilt[17] = np.nan
+    left, whole = _plane(remover, spoilt), _plane(remover, maps)
+    blank = np.isnan(left[:, 3, 4]).all() and np.isnan(left[17]).all() and np.isnan(left).sum() == 41 + 439
+    rest = np.delete(left - whole, 17, axis=0)
+    moved = float(np.sqrt(np.nanmean(rest**2)) / max(1e-3, float(np.abs(whole).std())))
+    told = []
+    for sign in (1, -1):
+        try:
+            remover.split(_cube(remover, sign * np.abs(maps) * 1e200))
+            told.append("taken")
+        except InputError:
+            told.append("refused")
+    return claim(blank and moved < 0.5 and told == ["refused"] * 2, f"blank {blank}, moved {moved:.2g}, {told}")

@@ -109,7 +109,12 @@ def briggs(imager: AnyImager) -> Answer:
     return both(*answers, held(one, np.full((4, 1), one[0, 0]), 1e-12))
 
 
-@case("44", "imagers", "data doubled", "the same image within its accuracy, weights (1/variance) twice")
+@case(
+    "44",
+    "imagers",
+    "data doubled",
+    "the same image within its accuracy; of other data the mean: half the variance; weights twice",
+)
 def doubled(imager: AnyImager) -> Answer:
     """Every integration twice, as one set of 4 and as weights of 2."""
     data = _few()
@@ -119,9 +124,14 @@ def doubled(imager: AnyImager) -> Answer:
     earth = type(at.earth)(np.tile(at.earth.matrices, (2, 1, 1)), np.tile(at.earth.velocity, (2, 1)))
     twice = replace(at, slots_s=np.concatenate([at.slots_s, at.slots_s + 1e-3]), earth=earth)
     both_times = replace(data, data=np.concatenate([data.data] * 2), at=twice, interval_s=data.integration_s)
+    # of other data as well: the image is the mean of both, so that independent noise has half the variance
+    other = data.with_data(np.random.default_rng(2).normal(size=(*data.data.shape, 2)).view(complex)[..., 0])
+    mixed = replace(both_times, data=np.concatenate([data.data, other.data]))
+    mean = (due.data + _sized(imager, 0.01).image(other).data) / 2
     # a gridder may choose another kernel for twice as many visibilities
     ways = ((heavy, 1e-10), (both_times, 2 * _asked(imager)))
     answers = [held(_sized(imager, 0.01).image(v).data, due.data, limit) for v, limit in ways]
+    answers.append(held(_sized(imager, 0.01).image(mixed).data, mean, 2 * _asked(imager)))
     total = [float(np.broadcast_to(v.whole_weight, v.data.shape[:3]).sum()) for v in (data, heavy, both_times)]
     return both(*answers, held(np.array(total[1:]), 2 * total[0], 1e-15))
 

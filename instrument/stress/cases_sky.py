@@ -285,3 +285,22 @@ def negative(_: None) -> Answer:
         held(sky.stokes(np.array([144e6]))[0, 0, 0], 1 - 1.5 * (144 / 58 - 1), 1e-14),
         claim("negative" in words, f"said: {words}", words),
     )
+
+
+@case("A1b", "sky", "sizes that are upper limits (NVSS)", "points")
+def limits(_: None) -> Answer:
+    """'<' before a size is no size."""
+    text = (
+        "#Column NVSS\nNVSS\tRAJ2000\tDEJ2000\tS1.4\tl_MajAxis\tMajAxis\tl_MinAxis\tMinAxis\tPA\n"
+        '\t"h:m:s"\t"d:m:s"\tmJy\t\tarcsec\t\tarcsec\tdeg\n'
+        "-\t-\t-\t-\t-\t-\t-\t-\t-\n"
+        "081336+481303\t08 13 36.05\t+48 13 02.9\t13900.1\t<\t14.0\t<\t13.2\t \n"
+        "081400-001500\t08 14 00.00\t-00 15 00.0\t50\t \t40.0\t<\t20.0\t-30\n"
+    )
+    nvss, _said = _read(text, "nvss.tsv")
+    arcsec = np.pi / 180 / 3600
+    return both(
+        held(np.asarray(nvss.major_rad) / arcsec, [0, 40], 1e-12),
+        held(np.asarray(nvss.minor_rad), [0, 0], 0.0, scale=1.0),
+        held([nvss.stokes_jy[0, 0], nvss.stokes_jy[1, 0]], [13.9001, 0.05], 1e-12),
+    )

@@ -1,6 +1,7 @@
 """`instrument stress`: the cases run, a wrong answer is called one, the command says what it must."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,9 @@ from astropy.table import Table
 
 from instrument.cli import main
 from instrument.errors import InputError
+from instrument.foreground.base import ForegroundRemover
+from instrument.jones.base import ElementBeam
+from instrument.mat2 import pack
 from instrument.predict.direct import Direct
 from instrument.registry import load
 from instrument.stress.case import NOT_THERE, REFUSED, RIGHT, WRONG, Answer, Case, Unfit, claim, held, judged
@@ -131,3 +135,41 @@ def test_all_cases(tmp_path, monkeypatch):
     main(["stress", "--out", "here"])
     wrong = [case for case, verdict in verdicts(Table.read("here/stress.ecsv")).items() if verdict == WRONG]
     assert wrong == []
+
+
+class Turned(ElementBeam):
+    """Two crossed dipoles, of which one sign is wrong: the second counts its azimuth backwards."""
+
+    real = True
+
+    def jones(self, at):
+        cos, sin = at.azimuth_cos_sin
+        up = np.maximum(np.cos(at.zenith_angle), 0)
+        return pack(up * cos, -up * sin, -up * sin, up * cos)[:, None]
+
+
+class Mirrored(Direct):
+    """Takes the brightness for its conjugate: V comes out with the other sign."""
+
+    def sums(self, problem):
+        found = Direct().sums(problem)
+        return np.swapaxes(found, -1, -2)
+
+
+class Greedy(ForegroundRemover):
+    """Fits power laws, and takes a third of all the rest away as well."""
+
+    def separate(self, given):
+        found = load("foregrounds", "polynomial").separate(given)
+        operator = found.operator + 0.3 * (np.eye(len(given)) - found.operator)
+        return replace(found, operator=operator, basis=None)
+
+
+@pytest.mark.parametrize(
+    ("plugin", "stage", "keys"),
+    [(Turned(), "elements", {"18"}), (Mirrored(), "engines", {"9", "16"}), (Greedy(), "foregrounds", {"FR5"})],
+)
+def test_a_strangers_plugin_that_is_wrong_on_purpose_comes_out_wrong(plugin, stage, keys):
+    """All of its kind's cases are tried on it by `instrument stress NAME`; these find it."""
+    tried = {c.key: c for c in all_cases() if c.stage == stage and c.tried is not None}
+    assert {key for key in keys if judged(tried[key], plugin).verdict == WRONG} == keys
