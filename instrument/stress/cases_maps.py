@@ -346,5 +346,12 @@ def zeros(_: None) -> Answer:
     words = " ".join(str(w.message) for w in said)
     blank = np.zeros(data.shape, bool)
     blank[2] = blank[:, :, :3] = blank[4, 0] = True
+    few = np.zeros((3, 4, 20, 20))
+    few[1] = keep[0]  # all but one channel flagged
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        alone = StokesCube(few, FREQ * u.Hz, 1 * u.arcmin, "K").data
+    if not (np.isnan(alone[[0, 2]]).all() and np.array_equal(alone[1], few[1])):
+        return claim(False, "two channels of three are 0, and count as data")
     right = np.isnan(found[blank]).all() and np.array_equal(found[~blank], keep[~blank])
     return claim(right and "no data" in words, f"blank {np.isnan(found).sum()} of {blank.sum()}; {words}")

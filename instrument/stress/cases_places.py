@@ -18,7 +18,7 @@ from instrument.observe.observation import Observation
 from instrument.observe.sampling import Sampling, mjd_seconds, times_of
 from instrument.stress.bench import GROUND, small_array
 from instrument.stress.case import Answer, both, case, claim, held
-from instrument.units import Direction, unit_vectors
+from instrument.units import Direction, Float, unit_vectors
 
 CENTRE = Direction(2.15, 0.84)
 ARCSEC = np.pi / 180 / 3600
@@ -159,11 +159,19 @@ def stations(_: None) -> Answer:
         _refused(lambda: Layout.geodetic(("a", "b"), np.array([[0, 0, 0], [100, 0, 0.0]])), "from_enu"),
         _refused(lambda: made.with_fields(axes=made.axes[:, [1, 0, 2]]), "left-handed"),
         _refused(lambda: made.with_fields(axes=made.axes[:, [1, 2, 0]]), "from the vertical"),
+        _refused(lambda: made.with_fields(axes=_tilted(made.axes)), "station 'c' is 30 deg"),
         _refused(lambda: made.with_fields(axes=1.01 * made.axes), "orthonormal"),
         _refused(lambda: made.with_fields(positions_m=made.positions_m * 1e-3), "centre of the Earth"),
         _refused(lambda: Layout.geodetic(made.names, made.positions_m * 1.01), "centre of the Earth"),
         claim(np.linalg.norm(made.positions_m, axis=1).max() < GROUND, "no station on the ground"),
     )
+
+
+def _tilted(axes: Float) -> Float:
+    """Those of the third station turned by 30 deg about its first axis."""
+    out, (cos, sin) = axes.copy(), (np.cos(np.pi / 6), np.sin(np.pi / 6))
+    out[2] = np.array([[1, 0, 0], [0, cos, sin], [0, -sin, cos]]) @ axes[2]
+    return np.asarray(out)
 
 
 @case("G5", "geometry", "the time of transit", "azimuth 0 or 180 deg for astropy, to 5 arcsec, within that day")
