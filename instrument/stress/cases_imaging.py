@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from instrument.image.base import AnyImager
+from instrument.image.weights import Density
 from instrument.observe.directions import LIGHT
 from instrument.stress.bench import field, observed, small_array
 from instrument.stress.case import Answer, Unfit, both, case, claim, held, not_there
@@ -90,8 +91,6 @@ def edge(imager: AnyImager) -> Answer:
 @case("43", "imagers", "Briggs +-infinity, and one hit a cell", "natural and uniform weights, to 1e-12", refusal=True)
 def briggs(imager: AnyImager) -> Answer:
     """The factors on the weights, at robust 20 and -20, where they are at their limits; one hit a cell: both alike."""
-    from instrument.image.weights import Density
-
     if "weighting" not in type(imager).model_fields:
         raise Unfit("it takes no weighting")
     rng = np.random.default_rng(1)
@@ -153,6 +152,33 @@ def nothing_of_one(imager: AnyImager) -> Answer:
     blank = np.isnan(first[:, 2:]).all() and np.isnan(whole[1]).all()
     kept = both(held(first[:, :2], due[:, :2], 1e-6), held(whole[0], due[0], 1e-6))
     return both(kept, claim(blank, "numbers of a Stokes parameter or channel that has no weight"))
+
+
+@case("K8", "cubes", "densities of the uv plane by hand", "weights of Briggs (1995) at robust -1, 0, 1, to 1e-13")
+def density(_: None) -> Answer:
+    """20 x 20 cells of 4 wavelengths, both halves; visibilities of 3 weights; one beyond the grid has none."""
+    rng = np.random.default_rng(2)
+    uv, weight = rng.uniform(-35, 35, (200, 2)), rng.uniform(0.5, 2, (200, 1))
+    uv[0] = 60, 3
+    made = Density(20, 1 / 80)
+    made.add(uv[:120], weight[:120])
+    made.add(uv[120:], weight[120:])
+    cell = np.round(uv / 4).astype(int)
+    inside = np.all((cell >= -10) & (cell < 10), axis=1)
+    back = np.all((-cell >= -10) & (-cell < 10), axis=1)
+    total: dict[tuple[int, int], float] = {}
+    for (a, b), w, one, two in zip(cell.tolist(), weight[:, 0], inside, back, strict=True):
+        if one:
+            total[a, b] = total.get((a, b), 0.0) + w
+        if two:
+            total[-a, -b] = total.get((-a, -b), 0.0) + w
+    mine = np.array([total.get((a, b), 0.0) if ok else 0.0 for (a, b), ok in zip(cell.tolist(), inside, strict=True)])
+    mean = sum(t**2 for t in total.values()) / (2 * weight.sum())
+    answers = [held(made.factor(uv, "uniform", 0.0)[:, 0], np.where(inside, 1 / np.where(inside, mine, 1), 0), 1e-13)]
+    for robust in (-1.0, 0.0, 1.0):
+        due = np.where(inside, 1 / (1 + (5 * 10**-robust) ** 2 / mean * mine), 0)
+        answers.append(held(made.factor(uv, "briggs", robust)[:, 0], due, 1e-13))
+    return both(*answers)
 
 
 NO_CLEAN, NO_BEAMS = "there is no CLEAN", "there is no imager that knows beams"

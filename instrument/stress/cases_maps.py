@@ -12,7 +12,6 @@ from instrument.image.beam_leakage import leaked_through
 from instrument.image.cube import StokesCube
 from instrument.image.mocks import Screens, leaked, noise_cube, polarized_screens
 from instrument.image.psf import Psf, fit_psf
-from instrument.image.weights import Density
 from instrument.model import Composed
 from instrument.observe.directions import offset
 from instrument.stress.bench import small_array
@@ -300,33 +299,6 @@ def behind(_: None) -> Answer:
     row = np.broadcast_to(m, (3, 63, 4, 4))[:, :, 0, 1:].reshape(3, 9, 7, 3)
     due = data[:, 0] + np.einsum("fyxk,fkyx->fyx", row, data[:, 1:])
     return both(held(found.data[:, 0], due, 1e-5), held(found.data[:, 1:], data[:, 1:], 0.0))
-
-
-@case("K8", "cubes", "densities of the uv plane by hand", "weights of Briggs (1995) at robust -1, 0, 1, to 1e-13")
-def density(_: None) -> Answer:
-    """20 x 20 cells of 4 wavelengths, both halves; visibilities of 3 weights; one beyond the grid has none."""
-    rng = np.random.default_rng(2)
-    uv, weight = rng.uniform(-35, 35, (200, 2)), rng.uniform(0.5, 2, (200, 1))
-    uv[0] = 60, 3
-    made = Density(20, 1 / 80)
-    made.add(uv[:120], weight[:120])
-    made.add(uv[120:], weight[120:])
-    cell = np.round(uv / 4).astype(int)
-    inside = np.all((cell >= -10) & (cell < 10), axis=1)
-    back = np.all((-cell >= -10) & (-cell < 10), axis=1)
-    total: dict[tuple[int, int], float] = {}
-    for (a, b), w, one, two in zip(cell.tolist(), weight[:, 0], inside, back, strict=True):
-        if one:
-            total[a, b] = total.get((a, b), 0.0) + w
-        if two:
-            total[-a, -b] = total.get((-a, -b), 0.0) + w
-    mine = np.array([total.get((a, b), 0.0) if ok else 0.0 for (a, b), ok in zip(cell.tolist(), inside, strict=True)])
-    mean = sum(t**2 for t in total.values()) / (2 * weight.sum())
-    answers = [held(made.factor(uv, "uniform", 0.0)[:, 0], np.where(inside, 1 / np.where(inside, mine, 1), 0), 1e-13)]
-    for robust in (-1.0, 0.0, 1.0):
-        due = np.where(inside, 1 / (1 + (5 * 10**-robust) ** 2 / mean * mine), 0)
-        answers.append(held(made.factor(uv, "briggs", robust)[:, 0], due, 1e-13))
-    return both(*answers)
 
 
 @case("E1", "cubes", "channels and rims of zeros (WSClean, CASA)", "no data: NaN, and said; lines that cross 0 stay")
