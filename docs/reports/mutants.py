@@ -277,6 +277,7 @@ def main() -> None:
     parser.add_argument("--only", default="", help="numbers of the table, with commas")
     parser.add_argument("--out", type=Path, default=HERE)
     parser.add_argument("--folder", type=Path, default=None, help="kept, so that the next call need not begin anew")
+    parser.add_argument("--known", action="store_true", help="take survivors of the folder as they are, too")
     given = parser.parse_args()
     every, results = sites(), {}
     with tempfile.TemporaryDirectory() as folder:
@@ -294,7 +295,8 @@ def main() -> None:
                 if given.only and k not in map(int, given.only.split(",")):
                     continue
                 found = done.get(f"{seed}|{key(site)}|{site.nth}|{digest([copy.path(site)])}")
-                found = Found(site, *found) if found and found[0] else copy.tried(site, before, most)
+                known = found and (found[0] or given.known)
+                found = Found(site, *found) if known else copy.tried(site, before, most)
                 results[seed].append(found)
                 done[f"{seed}|{key(site)}|{site.nth}|{digest([copy.path(site)])}"] = found[1:]
                 if given.folder:

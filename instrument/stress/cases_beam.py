@@ -180,6 +180,29 @@ def wrapped(_: None) -> Answer:
     return held(table.jones(at)[0, 0, 0, 0], -np.eye(2), 1e-12)
 
 
+@case(
+    "29b", "jones", "full matrices between two slots and two channels", "U0 (U0^H U1)^s ((1 - s) H0 + s H1), to 1e-12"
+)
+def turning(_: None) -> Answer:
+    """Random matrices a third of a turn apart, 0.3 of the way, by scipy's polar form and power of a matrix."""
+    from scipy.linalg import expm, fractional_matrix_power, polar
+
+    at = still([[0, 0, 0]], LIGHT * np.array([1.0, 1.0003]))
+    rng = np.random.default_rng(4)
+    a, b = rng.normal(size=(2, 2, 2, 2)).view(complex)[..., 0] * 0.3
+    first = np.eye(2) + a
+    second = expm(1.1j * (b + b.conj().T)) @ first
+    (u0, h0), (u1, h1) = polar(first), polar(second)
+    due = u0 @ fractional_matrix_power(u0.conj().T @ u1, 0.3) @ (0.7 * h0 + 0.3 * h1)
+    slots, freq = at.slots_s[0] + np.array([-3.0, 7.0]), LIGHT * np.array([1.0, 1.001])
+    rows = np.stack([first, second])
+    times = JonesTable(values=rows[:, None, None], slots_s=slots, freq_hz=freq[:1], interpolation="linear")
+    channels = JonesTable(values=rows[None, :, None], slots_s=slots[:1], freq_hz=freq, interpolation="linear")
+    found = channels.jones(at)[0, :, 0, 0]
+    ends = JonesTable(values=rows[:, None, None], slots_s=slots, freq_hz=freq[:1]).jones(at)[0, 0, 0, 0]
+    return both(held(times.jones(at)[0, 0, 0, 0], due, 1e-12), held(found, [first, due], 1e-10), held(ends, first, 0.0))
+
+
 @case("38", "jones", "two full Jones terms in the other order, and two scalar ones", "differs by AB - BA; the same")
 def order(_: None) -> Answer:
     """Feeds of 30 % before gains of 30 %; a phase before a gain."""

@@ -104,8 +104,8 @@ def quiet(_: None) -> Answer:
     "by hand with the truth; without it pulls of 0.6 to 1.5",
 )
 def score(_: None) -> Answer:
-    """A projection on one law of two, whole and 0.4 of it; 14 noises; low delays, k_perp within limits."""
-    freq, smooth, _n = _maps(2, 0.05, (14, 15))
+    """A projection on one law of two, whole and 0.1 of it; 14 noises; low delays, k_perp within limits."""
+    freq, smooth, _n = _maps(2, 0.01, (14, 15))
     law = (freq / 150e6) ** -2.3
     cut = Cut(freq, STEP / 2, 0.06, (0.02, 0.5), "blackman-harris")
     _z, distance, per_hz = mpc(freq)
@@ -114,7 +114,7 @@ def score(_: None) -> Answer:
     sides = np.meshgrid(np.fft.fftfreq(14, STEP / 2), np.fft.fftfreq(15, STEP / 2), indexing="ij")
     inside = (np.hypot(*sides) * 2 * np.pi / distance > 0.02) & (np.hypot(*sides) * 2 * np.pi / distance < 0.5)
     answers, told = [], []
-    for share in (1.0, 0.4):
+    for share in (1.0, 0.1):
         operator, pulls = share * np.outer(law, law) / (law @ law), []
 
         def applied(maps: Float, by: Float = operator) -> Float:
