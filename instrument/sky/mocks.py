@@ -85,7 +85,8 @@ class RandomSky(GeneratedSky):
 
     Stokes I is drawn from dN/dS ~ S^-`slope` between `flux_min` and `flux_max`; every source is linearly polarised to
     the fraction `polarization` at a random angle, and its V/I is uniform within +-`circular`. Spectral indices are
-    Gaussian: mean `spectral_index`, width `scatter`. The same `seed` gives the same sources.
+    Gaussian: mean `spectral_index`, width `scatter`. The same `seed` gives the same sources: numpy's default generator
+    draws for all of them distance, position angle and flux, the angle of Q + iU = P exp(2 pi i x), V, and the index.
     """
 
     count: Count = 100

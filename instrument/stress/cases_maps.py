@@ -115,9 +115,13 @@ def one_beam(_: None) -> Answer:
     flat = _cube(np.ones((3, 4, 30, 30)), "K", psf=psf).at_common_beam()
     round_ = _gauss((81, 81), 6 * ARCMIN, 6 * ARCMIN, 0, 0.5 * ARCMIN)
     wide = _gauss((81, 81), 8 * ARCMIN, 7 * ARCMIN, np.deg2rad(30), 0.5 * ARCMIN)
+    seen = Psf(data[:, 0], psf.major_rad, psf.minor_rad, psf.angle_rad, np.zeros(3))
+    lobes = cube.with_psf(seen).at_common_beam().psf
+    assert lobes is not None and lobes.data is not None
     known = circle.psf, asked.psf
     assert known[0] is not None and known[1] is not None
     return both(
+        held(lobes.data, np.broadcast_to(round_, lobes.data.shape), 2e-4),
         held(circle.data, np.broadcast_to(round_, data.shape), 2e-4),
         held(asked.data, np.broadcast_to(wide, data.shape), 2e-4),
         held(known[0].major_rad, 6 * ARCMIN, 1e-9),

@@ -174,6 +174,32 @@ def _tilted(axes: Float) -> Float:
     return np.asarray(out)
 
 
+@case(
+    "G4b",
+    "geometry",
+    "an array of 4000 km in one plane",
+    "taken to 10 deg and its length over 6340 km from the vertical",
+)
+def wide(_: None) -> Answer:
+    """Two stations with the axes of the first, of which the second leans: 0.1 deg within the limit and beyond it."""
+    ends = Layout.geodetic(("a", "b"), np.array([[3.8e6, 0.4e6, 5.07e6], [3.8e6, 4.1e6, 3.0e6]])).positions_m
+    up = Layout.geodetic(("a", "b"), ends).axes[:, 2]
+    most = np.deg2rad(10) + np.linalg.norm(ends[0] - ends[1]) / 6.34e6
+    across = np.cross(up[1], up[0])
+    across /= np.linalg.norm(across)
+
+    def leaning(angle: float) -> Layout:
+        r = np.cos(angle) * up[1] + np.sin(angle) * np.cross(across, up[1])
+        axes = np.stack([Layout.geodetic(("a",), ends[:1]).axes[0], np.stack([np.cross(across, r), across, r])])
+        return Layout(names=("a", "b"), positions_m=ends, axes=axes)
+
+    taken = leaning(most - np.deg2rad(0.1))
+    return both(
+        claim(len(taken) == 2, "refused"),
+        _refused(lambda: leaning(most + np.deg2rad(0.1)), "from the vertical"),
+    )
+
+
 @case("G5", "geometry", "the time of transit", "azimuth 0 or 180 deg for astropy, to 5 arcsec, within that day")
 def culmination(_: None) -> Answer:
     """A source north of the zenith, one south of it, and one that culminates just after midnight."""

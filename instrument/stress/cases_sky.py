@@ -94,6 +94,28 @@ def random_sources(_: None) -> Answer:
     )
 
 
+@case("S2b", "sky", "random sources of a seed, drawn again", "those of numpy's generator in the order stated, to 1e-12")
+def redrawn(_: None) -> Answer:
+    """50 sources: distances by their share of the cap, fluxes by that of the number above them."""
+    from astropy import units as u
+
+    sky = RandomSky(count=50, radius=10 * u.deg, flux_min=0.1 * u.Jy, flux_max=50 * u.Jy, slope=1.9, polarization=0.3,
+                    circular=0.1, scatter=0.2, seed=11).about(CENTRE)  # fmt: skip
+    rng = np.random.default_rng(11)
+    far, around, share, turn = (rng.random(50) for _ in range(4))
+    v, index = rng.uniform(-1, 1, 50), rng.standard_normal(50)
+    angle = np.arccos(1 - far * (1 - np.cos(np.deg2rad(10))))
+    flux = (50**-0.9 + share * (0.1**-0.9 - 50**-0.9)) ** (-1 / 0.9)
+    east, north = np.sin(angle) * np.sin(2 * np.pi * around), np.sin(angle) * np.cos(2 * np.pi * around)
+    p = 0.3 * np.exp(2j * np.pi * turn)
+    due = flux[:, None] * np.stack([np.ones(50), p.real, p.imag, 0.1 * v], axis=1)
+    return both(
+        held(sky.stokes_jy, due, 1e-12),
+        held(lmn(sky.vectors, CENTRE)[:, :2], np.stack([east, north], axis=1), 1e-12, scale=1.0),
+        held(np.asarray(sky.spectral_terms)[:, 0], -0.75 + 0.2 * index, 1e-12),
+    )
+
+
 @case("S3", "sky", "polarized points at Faraday depths", "I = V = 0, P as asked, depths even between their ends")
 def screens(_: None) -> Answer:
     """2000 points of 2 Jy, -1.5 to 5 rad/m2, index -1: P at half the frequency is twice as large and turned."""
