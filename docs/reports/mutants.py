@@ -261,10 +261,12 @@ def page(every: list[Site], results: dict[int, list[Found]], command: str) -> st
 {date.today()}, {platform.machine()}, Python {platform.python_version()}, numpy {version("numpy")},
 numba {version("numba")}, instrument {version("instrument")}. Made by `{command}`.
 
-One place of the numerical code is made wrong in a copy of the package, and all stress cases are run on the copy until
-one of them finds it. Places: {len(every)} ({told}). What is drawn and what is left out by construction stands in
-`mutant_sites.py`. Seed 1 was chosen before anything was looked at, and holes that it showed were closed; other seeds
-were never used to close one. A mutant that cannot change an answer counts as a survivor all the same.
+One place of the numerical code is made wrong in a copy of the package, and the stress cases are run on the copy, those
+that enter the mutated function first, until one finds it; a mutant has survived where none of the cases that enter any
+function of its file does. Places: {len(every)} ({told}). What is drawn and what is left out by construction stands in
+`mutant_sites.py`. Seed 1 was chosen before anything was looked at; holes that it showed were closed with new cases, and
+its survivors tried again. Seed 2 was never used to close one. A mutant that cannot change an answer counts as a
+survivor all the same.
 """
     return "\n".join([head, *(section(seed, found, why) for seed, found in results.items())])
 
