@@ -21,7 +21,7 @@ from instrument.precision.truth import chain_jones, geometry, has_truth, paralla
 from instrument.units import Complex, Direction
 
 STATIONS, JUDGED = 12, 25  # stations and directions of which the truth is worked out
-DIRECTIONS, TIMES = (100, 400), 60
+DIRECTIONS, TIMES = (50, 400), 60
 START, STEP = "2012-12-07T01:00:00", 60.0  # s between times
 HELD = tuple(STEP * n for n in (1, 2, 3, 5, 10, 20, 30, 60))  # s for which a beam is held
 FIELD = 0.09  # rad: half a side of the field
