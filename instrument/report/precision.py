@@ -31,7 +31,12 @@ def precision_figure(
         axes[0].set_title(contest.name, loc="left", fontweight="bold")
         for ax in axes[:2]:
             ax.set_xlabel(seconds)
-        axes[0].legend(loc="best", fontsize=10, frameon=False)
+        if any(np.isfinite(row.asked) for row in rows):
+            axes[0].legend(loc="best", fontsize=10, frameon=False)
+        else:  # nothing was asked: the third panel is free
+            axes[2].clear()
+            axes[2].set_axis_off()
+            axes[2].legend(*axes[0].get_legend_handles_labels(), loc="center left", fontsize=11, frameon=False)
     return figure
 
 
