@@ -5,6 +5,7 @@
 Of each contest what to take at which error, and what it took here. Rewrites what stands below the heading "Measured".
 """
 
+import re
 import sys
 from pathlib import Path
 
@@ -23,7 +24,9 @@ def main():
     for folder in sys.argv[1:]:
         table = QTable.read(Path(folder) / "precision.ecsv")
         versions = ", ".join(f"{name} {version}" for name, version in table.meta["versions"].items())
-        made.append(f"{table.meta['made'][:10]}: `{table.meta['command']}`; {table.meta['machine']}; {versions}.")
+        command = re.sub(r"--out \S+", "--out runs/all", table.meta["command"])
+        machine = ", ".join(f"{name} {value}" for name, value in table.meta["machine"].items())
+        made.append(f"{table.meta['made'][:10]}: `{command}`; {machine}; {versions}.")
         for name in dict.fromkeys(table["contest"]):
             lines += rows_of(name, table[table["contest"] == name])
     text = (
