@@ -139,18 +139,17 @@ class Chain(Component):
 
     def moving(self, at: Sampling, order: int) -> list[tuple[JonesTerm, tuple[Float, Float]]]:
         """The scalar terms that know how fast they change, each with its `motion`."""
-        terms = [t for t in self.parts[self._outer_count() :] if t.structure == "scalar"]
-        return [(t, found) for t in terms if (found := t.motion(at, order)) is not None]
+        return [(t, found) for t in self.scalar_terms() if (found := t.motion(at, order)) is not None]
+
+    def scalar_terms(self) -> list[JonesTerm]:
+        """Those that are a number for each direction, which `factors` multiplies into one."""
+        return [t for t in self.parts[self._outer_count() :] if t.structure == "scalar"]
 
     def factors(self, at: Sampling, without: Sequence[JonesTerm] = ()) -> Factors:
         """The product as cheap factors, without some terms; equal to `jones` (tests/accuracy/test_agreement.py)."""
         split = self._outer_count()
         outer = [t.jones(at) for t in self.parts[:split]]
-        scalars = [
-            t.scalar(at)
-            for t in self.parts[split:]
-            if t.structure == "scalar" and not any(t is other for other in without)
-        ]
+        scalars = [t.scalar(at) for t in self.scalar_terms() if not any(t is other for other in without)]
         matrices = self._shared_terms()
         group = np.zeros(len(at.layout), int)
         where = at

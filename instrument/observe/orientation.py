@@ -25,7 +25,7 @@ def orientation_table() -> Any:
     """The table (astropy `IERS`) that `earth_orientation_table` would give without any download."""
     from astropy.utils import iers
 
-    if iers.earth_orientation_table._value is not None:
+    if getattr(iers.earth_orientation_table, "_value", None) is not None:
         return iers.earth_orientation_table.get()  # the user's own
     return _kept()
 

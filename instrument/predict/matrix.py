@@ -52,7 +52,8 @@ class Matrix(Predictor):
         between = 4.0 * slots * sources * stations * way.panels.between
         flops = gemm + 40 * phasors + 600 * matrices + between
         seconds = gemm / 25e9 + 4e-7 * matrices + (2.5e-9 + 4e-9) * slots * sources * stations
-        seconds -= 0.5 * gemm / 25e9 if way.single else 0.0
+        # products of many groups are always of 64 bit
+        seconds -= 0.5 * gemm / 25e9 if way.single and shares <= FEW else 0.0
         seconds += slots * sources * way.panels.seconds(parts, stations)
         seconds += 4e-7 * slots * len(problem.antenna1)  # sorting products into baselines
         scalars = 16 * stations * sources

@@ -107,7 +107,8 @@ def weights(slots_s: Float, nodes: Int) -> Float:
     for k in range(len(nodes)):
         for j in range(len(nodes)):
             if j != k:
-                out[..., k] *= (slots_s - at[..., j, None]) / (at[..., k] - at[..., j])[..., None]
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    out[..., k] *= (slots_s - at[..., j, None]) / (at[..., k] - at[..., j])[..., None]
     return out
 
 
@@ -117,14 +118,15 @@ def spread(slots_s: Float, panels: Panels) -> float:
     for which, nodes in panels.alike(len(slots_s)):
         found = slots_s[which]
         apart = np.abs(found[..., None] - found[:, None, nodes]).prod(axis=-1)
-        largest = max(largest, float(apart.max()))
+        largest = float(np.maximum(largest, apart.max()))
     return largest
 
 
 def unsteady(earth: EarthFrame, slots_s: Float, panels: Panels) -> float:
     """How far the Earth is from polynomials through the nodes once its rotation is taken out, rad.
 
-    Tables of UT1 and of the pole have a kink a day; what is smooth leaves nothing.
+    Tables of UT1 and of the pole have a kink a day, and times are kept to a microsecond; what is smooth leaves nothing.
+    NaN where two times of a panel are the same: no polynomial goes through them.
     """
     angle = EARTH_RATE * (slots_s - slots_s[0])
     cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
@@ -134,7 +136,7 @@ def unsteady(earth: EarthFrame, slots_s: Float, panels: Panels) -> float:
     for which, nodes in panels.alike(len(slots_s)):
         found = still[which]
         apart = found - weights(slots_s[which], nodes) @ found[:, nodes]
-        largest = max(largest, float(np.linalg.norm(apart, axis=-1).max()))
+        largest = float(np.maximum(largest, np.linalg.norm(apart, axis=-1).max()))
     return largest
 
 

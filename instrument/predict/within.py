@@ -70,7 +70,7 @@ def quickest(engine: Any, problem: Problem, tolerance: float) -> Prepared:
         ready = Within(engine, problem, atom=(way.panels.size, 1), way=way)
         if ready.work(slice(0, way.panels.size), slice(0, 1)).slot_bytes > LARGEST_ATOM:
             continue
-        bound = _single(problem, peak, share) if way.single else 0.0
+        bound = _single(problem, share) if way.single else 0.0
         if bound <= tolerance and way.panels != EXACT:
             apart = way.panels.error(problem.at, [found for _, found in moving])
             bound += float((share * (2 * apart + apart**2)).sum(axis=-1).max())
@@ -80,15 +80,17 @@ def quickest(engine: Any, problem: Problem, tolerance: float) -> Prepared:
     return exact
 
 
-def _single(problem: Problem, peak: float, share: Float) -> float:
+def _single(problem: Problem, share: Float) -> float:
     """Bound on what 32 bit does to products of S points: factors (2 + 1), their product (sqrt 5), 2 S terms added.
 
-    Infinite where numbers may be too large for it.
+    Infinite where the numbers of the stations may be too large or too small for it; brightness and matrices are scaled.
     """
     listed = points_of(problem.sky)
     assert listed is not None  # or the engine would have refused
     count = int((~listed.gaussian).sum())
-    return SINGLE * (6 + 2 * np.sqrt(2) * count) * float(share.sum(axis=-1).max()) if peak < 1e6 else float("inf")
+    if not 1e-6 < float(np.prod([t.peak(problem.at) for t in problem.chain.scalar_terms()])) < 1e6:
+        return float("inf")
+    return SINGLE * (6 + 2 * np.sqrt(2) * count) * float(share.sum(axis=-1).max())
 
 
 def _said(way: Way, names: str) -> tuple[str, str]:

@@ -8,7 +8,7 @@ from astropy import units as u
 from astropy.coordinates import SkyCoord
 
 import instrument
-from instrument import ArrayFactor, Chain, GainTerm, Level, Observation, PointSky, Scene
+from instrument import ArrayFactor, Chain, Composed, GainTerm, Level, Observation, PointSky, ScalarTerm, Scene
 from instrument.predict.time_nodes import EXACT, Panels, spread, weights
 from instrument.predict.within import Within
 
@@ -123,3 +123,36 @@ def test_no_flux_is_too_large_or_too_small_for_32_bit(size):
     plan, exact = made.plan(tolerance=1e-3, engine="matrix"), made.plan(engine="matrix")
     assert plan.ready.way.single
     assert np.abs(plan.run().data - exact.run().data).max() <= plan.sum_bound * plan.scale_jy
+
+
+class Loud(ScalarTerm):
+    """A number that 32 bit hold once and not squared, times what takes it away again, (1, 1, 1, 1)."""
+
+    maps = ("feed", "feed")
+    size: float = 1.0
+
+    def peak(self, at):
+        return self.size
+
+    def scalar(self, at):
+        return np.full((1, 1, 1, 1), self.size)
+
+
+@pytest.mark.parametrize("size", [1e-30, 1e30])
+def test_numbers_that_32_bit_do_not_hold_stay_in_64(size):
+    """Also where a gain at the left end hides them from the peak of the chain."""
+    made = scene(count=3, whole=True)
+    quiet = GainTerm(values=np.full((1, 1, 1, 2), 1 / size))
+    chain = Chain(quiet, Loud(size=size), *made.plan().full.chain.terms)
+    lofar = Composed(stations=made.instrument.layout(), terms=chain)
+    loud = made.with_fields(instrument=lofar)
+    plan, exact = loud.plan(tolerance=1e-3, engine="matrix"), loud.plan(engine="matrix")
+    assert np.abs(plan.run().data - exact.run().data).max() <= plan.sum_bound * plan.scale_jy <= 1e-3 * plan.scale_jy
+    assert "32-bit" not in str(plan) and "32-bit" in str(made.plan(tolerance=1e-3, engine="matrix"))
+
+
+def test_two_integrations_at_one_time_have_no_bound():
+    at = scene().plan().full.at
+    (beam,) = (t for t in scene().plan().full.chain.parts if isinstance(t, ArrayFactor))
+    twice, panels = at.some(np.array([0, 0, 1, 2, 3, 4, 5, 6])), Panels(8, 4)
+    assert not np.any(panels.error(twice.some(np.array([0, 1, 1, 1, 4, 5, 6, 7])), [beam.motion(at, 4)]) <= 1.0)
