@@ -20,6 +20,7 @@ SHAPED = 24  # extended sources across which the beam is worked out; the effect 
 JONES = 1.5e5  # station Jones matrices spent on it, spread over times and channels
 SPOKES = 6
 NEAR_ZENITH, SPREAD = np.sin(np.deg2rad(1.0)), 24  # how near a zenith, and from how many azimuths it is looked at
+BESIDE = 1e-5  # rad from it: axes of stations are orthogonal to 1e-10 only, which turns azimuths at 1e-9 by 6 deg
 NODES, WEIGHTS = np.polynomial.laguerre.laggauss(3)  # rings of a two-dimensional Gaussian, in r^2 / 2
 
 
@@ -76,7 +77,7 @@ def _zenith(problem: Problem) -> list[Item]:
         return []
     at = problem.at.block(slice(0, 1), slice(None)).one_per_frame()
     angle = 2 * np.pi * np.arange(SPREAD) / SPREAD
-    local = np.stack([1e-9 * np.cos(angle), 1e-9 * np.sin(angle), np.ones(SPREAD)], axis=1)
+    local = np.stack([BESIDE * np.cos(angle), BESIDE * np.sin(angle), np.ones(SPREAD)], axis=1)
     around = replace(at.towards(np.zeros(SPREAD), np.zeros(SPREAD)), seen=(local @ at.layout.axes[0])[None])
     turn = mat2.pack(np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle))
     out = []

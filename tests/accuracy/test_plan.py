@@ -242,3 +242,22 @@ def test_a_beam_without_a_known_peak_is_named_in_the_bound_and_its_faint_sources
     assert not any("faint" in name for name in names(plan.left_out))
     known = Composed(stations=lofar.layout(), terms=Chain(GainTerm(rms=0.1, seed=1), CrossedDipole(height=0.5 * u.m)))
     assert names(scene().with_fields(instrument=known).plan().bounds) == ["float64 sums"]
+
+
+def test_the_seam_at_the_zenith_that_a_plan_prints_is_the_same_at_any_small_distance():
+    """Axes of stations are orthogonal to 1e-10: at 1e-9 rad from the zenith 0.06 was printed for 0.004."""
+    at = scene().plan().full.at
+    x, y, z = at.earth.matrices[0].T @ at.layout.axes[3, 2]
+    overhead = SkyCoord(np.arctan2(y, x) * u.rad, np.arcsin(z) * u.rad)
+    plan = scene(PointSky.at(SkyCoord([CENTRE, overhead]), [1.0, 1.0])).plan()
+    (text,) = (i.reason for i in plan.not_modelled if i.name == "zenith")
+    said = float(re.search(r"by (\S+),", text)[1])
+    element = next(t for t in plan.full.chain.parts if isinstance(t, ElementBeam))
+    at, angle = plan.full.at.block(slice(0, 1), slice(None)), 2 * np.pi * np.arange(24) / 24
+    turn = np.moveaxis(np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]), -1, 0)
+    for beside in (1e-3, 1e-4, 1e-5):
+        local = np.stack([beside * np.cos(angle), beside * np.sin(angle), np.ones(24)], axis=1)
+        around = replace(at.towards(np.zeros(24), np.zeros(24)), seen=(local @ at.layout.axes[3])[None])
+        ground = element.jones(around)[0, 0, 3] @ turn
+        found = np.abs(ground - ground[:1]).max() / np.abs(ground[0]).max()
+        assert said == pytest.approx(found, rel=0.05) and found < element.zenith_seam
