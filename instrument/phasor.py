@@ -10,17 +10,16 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba
 import numpy as np
 
-from instrument.compiled import compiled
+from instrument.compiled import compiled, inlined
 from instrument.units import Complex, Float
 
 FAST = {"contract", "nsz", "nnan", "ninf"}  # no reassociation: sums keep their order, so results repeat
 CHUNK = 256
 
 
-@numba.njit(inline="always")
+@inlined
 def cis(cycles: float) -> Any:
     """Cosine and sine of 2 pi `cycles`; Taylor series on an eighth of a turn, error below 1.2e-16."""
     q = np.rint(4.0 * cycles)

@@ -40,6 +40,7 @@ from instrument.numbers import Tolerance as Tolerance
 from instrument.numbers import UvRange as UvRange
 from instrument.numbers import Whole as Whole
 from instrument.numbers import brief, out_of_range, unmasked
+from instrument.written import icrs_degrees
 
 Complex = NDArray[np.complexfloating[Any, Any]]
 Float = NDArray[np.float64]
@@ -234,6 +235,7 @@ def unit_vectors(ra_rad: Float, dec_rad: Float) -> Float:
     return np.stack([np.cos(dec_rad) * np.cos(ra_rad), np.cos(dec_rad) * np.sin(ra_rad), np.sin(dec_rad)], axis=-1)
 
 
+DEGREE = float(np.pi / 180)
 WRITTEN = re.compile(r"(\S+)rad (\S+)rad")  # as `_write_direction` has it: read without any arithmetic
 
 
@@ -246,6 +248,8 @@ def direction(value: object, name: str = "the direction") -> Direction:
     written = WRITTEN.fullmatch(value) if isinstance(value, str) else None
     if written:
         value = Direction(float(written[1]), float(written[2]))
+    elif isinstance(value, str) and (degrees := icrs_degrees(value)):
+        return Direction(*(DEGREE * angle for angle in degrees))
     if isinstance(value, Direction):
         if not np.all(np.isfinite(value)) or abs(value.dec_rad) > np.pi / 2:
             raise InputError(f"{name} = {tuple(value)} rad is not a direction")

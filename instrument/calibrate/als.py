@@ -8,17 +8,16 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 
-from instrument.compiled import compiled
+from instrument.compiled import compiled, inlined
 from instrument.phasor import FAST
 from instrument.units import Complex, Float
 
 LANES = 16
 
 
-@numba.njit(inline="always")
+@inlined
 def _mul_h(a: Any, b: Any) -> Any:
     """A B^H of matrices given as 8 reals: re 00, im 00, re 01, im 01, re 10, im 10, re 11, im 11."""
     return (
@@ -33,12 +32,12 @@ def _mul_h(a: Any, b: Any) -> Any:
     )
 
 
-@numba.njit(inline="always")
+@inlined
 def _herm(a: Any) -> Any:
     return (a[0], -a[1], a[4], -a[5], a[2], -a[3], a[6], -a[7])
 
 
-@numba.njit(inline="always")
+@inlined
 def _at(x: Any, i: int, lane: int) -> Any:
     return (
         x[i, 0, lane], x[i, 1, lane], x[i, 2, lane], x[i, 3, lane],

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 
-from instrument.compiled import compiled
+from instrument.compiled import compiled, inlined
 from instrument.phasor import FAST
 from instrument.units import Complex, Float, Int
 
@@ -58,7 +57,7 @@ def normal_matrix(
     )
 
 
-@numba.njit(inline="always")
+@inlined
 def _entries(x: Any) -> Any:
     return x[0, 0], x[0, 1], x[1, 0], x[1, 1]
 

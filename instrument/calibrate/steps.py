@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 
-from instrument.compiled import compiled
+from instrument.compiled import compiled, inlined
 
 
-@numba.njit(inline="always")
+@inlined
 def _exponential(e: Any) -> Any:
     """exp of a 2x2 matrix as `mat2.exponential`: exp(t) (cosh(d) 1 + sinh(d) / d H)."""
     half = (e[0, 0] + e[1, 1]) / 2
@@ -96,7 +95,7 @@ def turned(jones: Any, step: Any, share: float, out: Any) -> None:
             out[a, i, 1] = jones[a, i, 0] * e01 + jones[a, i, 1] * e11
 
 
-@numba.njit(inline="always")
+@inlined
 def _power(x: Any) -> float:
     total = 0.0
     for i in range(2):

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from instrument.errors import InputError, warn
-from instrument.observe.orientation import orientation_table
+from instrument.observe.orientation import orientation
 from instrument.units import Direction, Float, Int
 
 LIGHT = 299792458.0
@@ -41,6 +41,15 @@ class EarthFrame:
         seen = moved @ np.swapaxes(self.matrices, 1, 2)
         seen /= np.sqrt(np.einsum("tsc,tsc->ts", seen, seen))[..., None]
         return seen
+
+    def sines(self, vectors: Float, normals: Float) -> Float:
+        """Products (S, T, G) of apparent directions, of ICRS unit vectors (S, 3), with ITRF unit vectors (G, 3)."""
+        turned = normals @ self.matrices  # (T, G, 3): one product with all directions, and none of them in ITRF
+        found = (vectors @ turned.reshape(-1, 3).T).reshape(len(vectors), *turned.shape[:2])
+        found += np.einsum("tgc,tc->tg", turned, self.velocity)
+        lengths = 1.0 + 2.0 * (vectors @ self.velocity.T) + np.einsum("tc,tc->t", self.velocity, self.velocity)
+        found /= np.sqrt(lengths)[..., None]
+        return found
 
     def carried(self, tangents: Float, seen: Float) -> Float:
         """ICRS tangent vectors (S, 3) at some directions carried to where those are `seen` (T, S, 3), unit length.
@@ -77,23 +86,16 @@ def earth_frame(times: Any, site_m: Float) -> EarthFrame:
     Warns when a time lies outside the bundled IERS table; UT1 - UTC is then taken as 0 (at most 0.9 s, 13.5 arcsec).
     """
     import erfa
-    from astropy.utils import iers
 
     times = times.utc
-    with iers.conf.set_temp("auto_download", False), iers.conf.set_temp("auto_max_age", None):
-        table = orientation_table()
-        jd1, jd2 = np.atleast_1d(times.jd1), np.atleast_1d(times.jd2)
-        ut1_utc, status = table.ut1_utc(jd1, jd2, return_status=True)
-        pole_x, pole_y, _ = table.pm_xy(jd1, jd2, return_status=True)
-    outside = np.asarray(status) < 0
+    jd1, jd2 = np.atleast_1d(times.jd1), np.atleast_1d(times.jd2)
+    ut1_utc, xp, yp, outside = orientation(jd1, jd2)
     if outside.any():
         warn(
             f"{outside.sum()} of {outside.size} times lie outside the Earth orientation table: UT1-UTC is taken as 0 "
             "there, an error of up to 0.9 s (13.5 arcsec)"
         )
-    ut1_utc = np.where(outside, 0.0, ut1_utc.to_value("s"))
-    xp = np.where(outside, 0.0, pole_x.to_value("rad"))
-    yp = np.where(outside, 0.0, pole_y.to_value("rad"))
+    ut1_utc, xp, yp = (np.where(outside, 0.0, found) for found in (ut1_utc, xp, yp))
     ut1 = erfa.utcut1(jd1, jd2, ut1_utc)
     tt = np.atleast_1d(times.tt.jd1), np.atleast_1d(times.tt.jd2)
     matrices = erfa.c2t06a(*tt, *ut1, xp, yp)

@@ -181,14 +181,19 @@ class Sampling:
         for t in range(0, len(self.earth), step):
             part = self.block(slice(t, t + step), slice(0, 1)).one_per_frame()
             axes = part.layout.axes
-            up = part.itrf @ axes[:, 2].T  # (T, S, G)
-            np.maximum(found.highest, up.max(axis=(0, 2)), out=found.highest)
-            np.minimum(found.lowest, up.min(axis=(0, 2)), out=found.lowest)
-            np.minimum(found.horizon, np.abs(up).min(axis=(0, 2)), out=found.horizon)
-            aside = np.sqrt(np.maximum(1.0 - up**2, 0.0))
-            k, s, g = np.nonzero(aside < 1e-3)  # 1 - up^2 has lost 6 digits there, and all of them at the zenith
-            aside[k, s, g] = np.hypot(*np.einsum("nic,nc->in", axes[g, :2], part.itrf[k, s]))
-            np.minimum(found.zenith, aside.min(axis=(0, 2)), out=found.zenith)
+            whole = part.seen is None  # or another program has seen them
+            up = part.earth.sines(part.vectors, axes[:, 2]) if whole else np.swapaxes(part.itrf @ axes[:, 2].T, 0, 1)
+            np.maximum(found.highest, up.max(axis=(1, 2)), out=found.highest)
+            np.minimum(found.lowest, up.min(axis=(1, 2)), out=found.lowest)
+            up = np.abs(up)
+            np.minimum(found.horizon, up.min(axis=(1, 2)), out=found.horizon)
+            near = np.sqrt(np.maximum(1.0 - up.max(axis=(1, 2)) ** 2, 0.0))
+            for s in np.flatnonzero(near < 1e-3):  # 1 - up^2 has lost 6 digits there, and all of them at the zenith
+                k, g = np.nonzero(up[s] > 1 - 1e-6)
+                one = part.some(k).towards(self.ra_rad[s : s + 1], self.dec_rad[s : s + 1])
+                there = one.itrf[:, 0] if whole else part.itrf[k, s]
+                near[s] = np.hypot(*np.einsum("nic,nc->in", axes[g, :2], there)).min()
+            np.minimum(found.zenith, near, out=found.zenith)
         return found
 
     @property

@@ -67,7 +67,7 @@ class _Lofar(Instrument):
     def layout(self) -> Layout:
         """The stations: surveyed phase centres and the axes of their antenna planes."""
         rows = self._rows()
-        columns = ("x", "y", "z") if "x" in rows.colnames else ("x_m", "y_m", "z_m")
+        columns = ("x", "y", "z") if "x" in rows.columns else ("x_m", "y_m", "z_m")
         positions = np.stack([rows[c] for c in columns], axis=1).astype(float)
         axes = np.stack([rows[k] for k in AXES], axis=1).astype(float).reshape(-1, 3, 3)
         return Layout(names=self.stations, positions_m=positions, axes=axes)

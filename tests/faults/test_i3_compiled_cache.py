@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from instrument import compiled
+from instrument import compiled_cache
 
 ROOT = Path(__file__).resolve().parents[2]
 KERNEL = '''
@@ -44,7 +44,7 @@ def loops(tmp_path, monkeypatch):
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
 
     def fresh():
-        compiled._said.clear()
+        compiled_cache._said.clear()
         spec = importlib.util.spec_from_file_location("sums", path)
         module = importlib.util.module_from_spec(spec)
         with warnings.catch_warnings(record=True) as said:
@@ -56,7 +56,7 @@ def loops(tmp_path, monkeypatch):
         return hits, [str(w.message) for w in said]
 
     yield tmp_path / "__pycache__", fresh
-    compiled._said.clear()
+    compiled_cache._said.clear()
 
 
 def test_i3_a_second_process_takes_the_cache(loops):
@@ -97,7 +97,7 @@ def test_i3_a_full_disk_keeps_nothing_and_says_so_once(loops, monkeypatch):
     def full(self, name, data):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(compiled._Checked, "_save_data", full)
+    monkeypatch.setattr(compiled_cache._Checked, "_save_data", full)
     hits, said = fresh()
     assert hits == [0, 0]
     assert len(said) == 1 and "could not be kept" in said[0] and "No space left on device" in said[0]

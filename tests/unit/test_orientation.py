@@ -25,17 +25,18 @@ def place(tmp_path, monkeypatch):
 
 def test_kept_values_are_those_of_the_table(place):
     whole = iers.earth_orientation_table.get()
+    far = Time(["1960-01-01", "2100-01-01"])
     for _ in range(2):  # read from text, and from what was kept
         orientation._kept.cache_clear()
-        found = orientation.orientation_table()
-        jd = TIMES.utc.jd1, TIMES.utc.jd2
-        assert np.array_equal(found.ut1_utc(*jd), whole.ut1_utc(*jd))
-        assert all(np.array_equal(a, b) for a, b in zip(found.pm_xy(*jd), whole.pm_xy(*jd), strict=True))
+        for times in (TIMES.utc, far):
+            jd = times.jd1, times.jd2
+            ut1_utc, x, y, outside = orientation.orientation(*jd)
+            due, status = whole.ut1_utc(*jd, return_status=True)
+            assert np.array_equal(ut1_utc, due.to_value("s"))
+            pole = whole.pm_xy(*jd, return_status=True)[:2]
+            assert all(np.array_equal(a, b.to_value("rad")) for a, b in zip((x, y), pole, strict=True))
+            assert np.array_equal(outside, status < 0) and outside.all() == (times is far)
         assert len(list(place.glob("orientation-*.npy"))) == 1
-    far = Time(["1960-01-01", "2100-01-01"])
-    assert np.array_equal(
-        found.ut1_utc(far.jd1, far.jd2, return_status=True)[1], whole.ut1_utc(far.jd1, far.jd2, return_status=True)[1]
-    )
 
 
 def test_a_damaged_file_is_read_anew(place):
@@ -51,6 +52,11 @@ def test_a_damaged_file_is_read_anew(place):
 
 
 def test_a_table_that_the_user_has_set_is_taken(place):
-    own = iers.IERS_B.open(iers.IERS_B_FILE)
+    own, jd = iers.IERS_B.read(iers.IERS_B_FILE), (TIMES.utc.jd1, TIMES.utc.jd2)
+    own["UT1_UTC"] += 0.1 * u.s
+    usual = orientation.orientation(*jd)
     with iers.earth_orientation_table.set(own):
-        assert orientation.orientation_table() is own
+        found = orientation.orientation(*jd)
+    due, status = own.ut1_utc(*jd, return_status=True)
+    assert np.array_equal(found[0], due.to_value("s")) and np.array_equal(found[3], status < 0)
+    assert np.allclose(found[0] - usual[0], 0.1) and np.array_equal(orientation.orientation(*jd), usual)
