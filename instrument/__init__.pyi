@@ -38,6 +38,7 @@ from .foreground.maps import StokesMaps as StokesMaps
 from .foreground.separation import Separation as Separation
 from .image.base import AnyImager as AnyImager
 from .image.beam_leakage import leaked_through as leaked_through
+from .image.clean import CleanImager as CleanImager
 from .image.cube import StokesCube as StokesCube
 from .image.dirty import Imager as Imager
 from .image.mocks import leaked as leaked

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import tempfile
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
@@ -27,6 +28,15 @@ from instrument.visibilities import Visibilities, VisibilitySet
 from instrument.visibility_sets import VisibilityFile
 
 
+@dataclass(frozen=True)
+class Imaged:
+    """What an imager has made: the cube, cubes beside it by name (a residual), and what a run records of it."""
+
+    cube: StokesCube
+    beside: Mapping[str, StokesCube] = field(default_factory=dict)
+    record: Mapping[str, Any] = field(default_factory=dict)
+
+
 class ImageSums(ABC):
     """Images in the making: blocks are added as they come by, `finish` gives the cube."""
 
@@ -38,6 +48,10 @@ class ImageSums(ABC):
     def finish(self) -> StokesCube:
         """The cube; raises `RefusedError` where nothing was added."""
 
+    def everything(self) -> Imaged:
+        """The cube, in place of `finish`, and what the imager makes beside it."""
+        return Imaged(self.finish())
+
 
 @checked
 class AnyImager(Component):
@@ -48,6 +62,8 @@ class AnyImager(Component):
     """
 
     plugin_kind: ClassVar[str | None] = "imagers"
+    planes_held: ClassVar[float] = 10  # images a channel, while it works, and of what it gives: for the plan of a run
+    planes_made: ClassVar[float] = 5
     pixels: Annotated[int, Field(ge=16, le=32768)]
     pixel: Annotated[Radians, Field(gt=0)]
     uv_range: tuple[float, float] | None = None
@@ -83,6 +99,12 @@ class AnyImager(Component):
 
         `operator` is the map from images to these visibilities, for imagers that know beams or subtract what they find.
         """
+
+    def imaged(
+        self, visibilities: VisibilitySet | Iterable[Visibilities], operator: ImageOperator | None = None
+    ) -> Imaged:
+        """What `image` gives, and the cubes beside it, of imagers that make any."""
+        return Imaged(self.image(visibilities, operator))
 
     def chosen(self, block: Visibilities, channel: int) -> tuple[Float, Float, Any]:
         """Baselines in wavelengths (N, 3) within the uv range, their weights (N,), and which ones (T, B) they are.
@@ -142,12 +164,16 @@ class Kept(ImageSums):
 
     def finish(self) -> StokesCube:
         """The images; the file is gone afterwards."""
+        return self.everything().cube
+
+    def everything(self) -> Imaged:
+        """All that the imager makes; the file is gone afterwards."""
         with self.folder:
             if self.writer is None:
                 raise RefusedError("no block of visibilities was given: nothing to image")
             with self._on_disk():
                 self.writer.finish()
-            return self.imager.image(VisibilityFile(self.path))
+            return self.imager.imaged(VisibilityFile(self.path))
 
     @contextmanager
     def _on_disk(self) -> Iterator[None]:

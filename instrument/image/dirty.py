@@ -101,11 +101,12 @@ class _Channel:
 
 
 class Images(ImageSums):
-    """Sums of images over blocks of visibilities; `finish` gives the cube."""
+    """Sums of images over blocks of visibilities; `finish` gives the cube, with its PSF unless `lobes` is False."""
 
-    def __init__(self, imager: Imager, density: dict[float, Density] | None) -> None:
+    def __init__(self, imager: Imager, density: dict[float, Density] | None, lobes: bool = True) -> None:
         self.imager = imager
         self.density = density
+        self.lobes = lobes
         self.channels: dict[float, _Channel] = {}
         self.centre: Any = None
         self.waiting = 0  # visibilities, in all channels
@@ -143,9 +144,10 @@ class Images(ImageSums):
         most = max(weight.shape[1] for _, weight, _ in channel.waiting)
         waiting = ((uvw, np.broadcast_to(w, (len(w), most)), values) for uvw, w, values in channel.waiting)
         uvw, weight, stokes = (np.concatenate(parts) for parts in zip(*waiting, strict=True))
-        columns = [*np.moveaxis(stokes, -1, 0), np.ones(len(weight), complex)]
-        images = [*channel.sums]
-        if most > 1 or channel.crossed is not None:
+        columns, images = [*np.moveaxis(stokes, -1, 0)], [*channel.sums]
+        if self.lobes:
+            columns.append(np.ones(len(weight), complex))
+        if self.lobes and (most > 1 or channel.crossed is not None):
             channel.crossed = images[4].copy() if channel.crossed is None else channel.crossed  # alike until now
             images, columns = [*images, channel.crossed], [*columns, columns[-1]]
         weights = np.broadcast_to(weight, (len(weight), 4)).T
@@ -204,5 +206,10 @@ class Images(ImageSums):
             pixel=self.imager.pixel * u.rad,
             unit="Jy/beam",
             centre=self.centre,
-            psf=fit_psf(psfs, self.imager.pixel),
+            psf=fit_psf(psfs, self.imager.pixel) if self.lobes else None,
         )
+
+    @property
+    def weights(self) -> Float:
+        """Sums of weights of I, Q, U, V in the channels, in order of frequency (F, 4)."""
+        return np.stack([self.channels[freq].weight for freq in sorted(self.channels)])

@@ -67,6 +67,8 @@ SETTINGS: dict[tuple[str, ...], list[dict[str, Any]]] = {
         {"pixels": 64, "pixel": 6 * u.arcmin},
         {"pixels": 64, "pixel": 6 * u.arcmin, "weighting": "briggs", "robust": 0.5, "accuracy": 1e-4},
     ],
+    ("imagers", "clean"): [{"pixels": 32, "pixel": 8 * u.arcmin, "cycles": 4}],
+    ("imagers", "clean", "long"): [{"peaks": "joint"}, {"terms": 1}, {"algorithm": "multiscale", "peaks": "I"}],
     ("stages", "noise"): [{"sefd": 100 * u.Jy, "seed": 1}],
     ("stages", "calibrate"): [{"calibrator": instrument.SelfCal(tolerance=1e-8)}],
     ("stages", "calibrate.incomplete-model"): [{"laboratory": instrument.IncompleteModel(models=(1, 3))}],
@@ -102,6 +104,13 @@ def test_every_registered_plugin_keeps_its_contract(kind, name, settings):
 @pytest.mark.parametrize("settings", SETTINGS["foregrounds", "gmca", "long"])
 def test_the_other_ways_of_gmca_keep_their_contract(settings):
     report = check(load("foregrounds", "gmca", **settings))
+    assert report.passed, str(report)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("settings", SETTINGS["imagers", "clean", "long"])
+def test_the_other_ways_of_clean_keep_their_contract(settings):
+    report = check(load("imagers", "clean", pixels=32, pixel=8 * u.arcmin, cycles=6, **settings))
     assert report.passed, str(report)
 
 

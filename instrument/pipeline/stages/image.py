@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -90,8 +90,8 @@ def imaging(imager: AnyImager, run: Running, count: int = 1) -> StageWork:
             f"from {si_prefix(64 * count * run.visibilities, 'B')} of files",
             seconds=count * KEEPING * run.visibilities,
             block_bytes=3 * 64.0 * float(np.prod(run.block)),
-            finish_bytes=count * 10 * channels * plane,
-            result_bytes=count * 5 * channels * plane,
+            finish_bytes=count * imager.planes_held * channels * plane,
+            result_bytes=count * imager.planes_made * channels * plane,
             wrong=imager.error(),
             remedy="lower image.pixels, or the number of channels",
         )
@@ -137,15 +137,18 @@ class _ImageRun(StageRun):
 
     def finish(self) -> StageResult:
         """The cube."""
-        return ImageResult(self.imager, self.images.finish())
+        made = self.images.everything()
+        return ImageResult(self.imager, made.cube, made.beside, made.record)
 
 
 @dataclass(frozen=True)
 class ImageResult(StageResult):
-    """Images of a run: a cube with its PSF."""
+    """Images of a run: a cube with its PSF, cubes beside it by name, and what the imager says of them."""
 
     imager: AnyImager
     cube: StokesCube
+    beside: Mapping[str, StokesCube] = field(default_factory=dict)
+    said: Mapping[str, Any] = field(default_factory=dict)
 
     def record(self) -> dict[str, Any]:
         """Unit, PSF and rms of the first channel."""
@@ -157,12 +160,15 @@ class ImageResult(StageResult):
                 "unit": self.cube.unit,
                 "psf_arcmin": [round(float(np.rad2deg(x[0]) * 60), 3) for x in widths],
                 "rms": {s: float(np.nanstd(self.cube.data[0, k])) for k, s in enumerate("IQUV")},
+                **self.said,
             },
         }
 
     def write(self, folder: Path) -> None:
-        """cube.fits."""
+        """cube.fits, and those beside it: model.fits, residual.fits."""
         self.cube.write(folder / "cube.fits")
+        for name, cube in self.beside.items():
+            cube.write(folder / f"{name}.fits")
 
     def cards(self) -> list[Card]:
         """The PSF."""
