@@ -1,4 +1,4 @@
-"""The compiled loop of a minor cycle: components at the peaks of some pixels, taken out of them with the PSF."""
+"""The compiled loops of a minor cycle: components at the peaks of pixels, taken out of them with the PSF."""
 
 from __future__ import annotations
 
@@ -59,3 +59,47 @@ def take(
         row, column = places[best, 0] - ny // 2, places[best, 1] - nx // 2
         done += 1
     return done, np.sqrt(max(top, 0.0))
+
+
+@compiled(nogil=True, error_model="numpy", fastmath={"nnan", "nsz", "reassoc", "contract"})
+def take_whole(image: Any, psf: Any, mask: Any, gain: float, limits: Any, taken: Any) -> tuple[int, float]:
+    """The same for all pixels of one image (Ny, Nx), in place, row by row: 8 times as quick a pixel as a list of them.
+
+    `mask` (Ny, Nx) is 1 where components may be and 0 elsewhere. Without a test whether a value is NaN, compilers find
+    the largest of a row in vectors.
+    """
+    ny, nx = image.shape
+    high, wide = psf.shape
+    signed = limits[2] > 0
+    flux, row, column, done, first = 0.0, 0, 0, 0, 0.0
+    while True:
+        top, where = -1.0, 0
+        for y in range(ny):
+            dy = y - row
+            if done > 0 and 0 <= dy < high:
+                left, right = max(column, 0), min(column + wide, nx)
+                line, lobe = image[y, left:right], psf[dy, left - column : right - column]
+                for x in range(right - left):
+                    line[x] -= flux * lobe[x]
+            most, whole, seen = 0.0, image[y], mask[y]
+            if signed:
+                for x in range(nx):
+                    most = max(most, abs(whole[x]) * seen[x])
+            else:
+                for x in range(nx):
+                    most = max(most, whole[x] * seen[x])
+            if most > top:
+                top, where = most, y
+        if done == 0:
+            first = top
+        if top <= limits[0] or done >= limits[1] or top > WORSE * first:
+            return done, top
+        best = 0
+        for x in range(nx):
+            if (abs(image[where, x]) if signed else image[where, x]) * mask[where, x] >= top:
+                best = x
+                break
+        flux = gain * image[where, best]
+        taken[where, best] += flux
+        row, column = where - high // 2, best - wide // 2
+        done += 1

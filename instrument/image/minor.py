@@ -7,10 +7,11 @@ from functools import cached_property
 
 import numpy as np
 
-from instrument.image.components import take
+from instrument.image.components import take, take_whole
 from instrument.units import Bool, Complex, Float
 
 BIAS = 0.6  # how much less a scale twice as large counts (Offringa & Smirnov 2017)
+WHOLE = 0.1  # of the pixels: where more are above the floor, all are gone through row by row
 AT_ONCE = 0.2  # of its peak, by which one scale is cleaned before the scales are looked at again
 
 
@@ -136,14 +137,7 @@ def minor_cycle(residual: Float, lobes: Lobes, search: Search, floor: float, mos
         if not top * bias > floor:
             break
         low = max(floor / bias, (1 - AT_ONCE) * top) if several else floor
-        rows, columns = np.nonzero(height > low)
-        values = np.ascontiguousarray(np.moveaxis(smooth[:, :, rows, columns], -1, 0))
-        psf, taken = lobes.smoothed[which], np.zeros_like(values)
-        gain = search.gain / psf[psf.shape[0] // 2, psf.shape[1] // 2]
-        places, limits = np.stack([rows, columns], axis=1), np.array([low, most - done, search.negative])
-        count, left = take(values, places, psf, search.share, search.fit, gain, limits, taken)
-        part = np.zeros_like(residual)
-        part[:, :, rows, columns] = np.moveaxis(taken, 0, -1)
+        part, count, left = _taken(smooth, height > low, lobes.smoothed[which], search, (low, most - done))
         if (kernel := lobes.kernels[which]) is not None:
             part = lobes.folding.back(lobes.folding.transform(part) * kernel)
         model += part
@@ -152,6 +146,27 @@ def minor_cycle(residual: Float, lobes: Lobes, search: Search, floor: float, mos
         if count == 0 or left > 1.5 * top:
             return model, done, count == 0
     return model, done, True
+
+
+def _taken(
+    images: Float, active: Bool, psf: Float, search: Search, limits: tuple[float, int]
+) -> tuple[Float, int, float]:
+    """Components at active pixels, as images (K, F, Ny, Nx), their number, and the peak that is left there."""
+    ny, nx, channels = psf.shape
+    gain, part = search.gain / psf[ny // 2, nx // 2], np.zeros_like(images)
+    ends = np.array([*limits, search.negative])
+    if len(images) == channels == 1 and np.count_nonzero(active) > WHOLE * active.size:
+        mask, weight = search.mask.astype(float), float(search.share[0, 0])
+        ends[0] /= weight
+        image = np.array(images[0, 0])
+        done, left = take_whole(image, np.ascontiguousarray(psf[..., 0]), mask, float(gain[0]), ends, part[0, 0])
+        return part, done, left * weight
+    rows, columns = np.nonzero(active)
+    values = np.ascontiguousarray(np.moveaxis(images[:, :, rows, columns], -1, 0))
+    taken, places = np.zeros_like(values), np.stack([rows, columns], axis=1)
+    done, left = take(values, places, psf, search.share, search.fit, gain, ends, taken)
+    part[:, :, rows, columns] = np.moveaxis(taken, 0, -1)
+    return part, done, left
 
 
 def _highest(residual: Float, lobes: Lobes, search: Search) -> tuple[int, Float, Float]:
