@@ -80,7 +80,9 @@ from .scene import Scene as Scene
 from .sky.base import PlacedSky as PlacedSky
 from .sky.base import Sky as Sky
 from .sky.image import ImageSky as ImageSky
+from .sky.pixels import PixelSky as PixelSky
 from .sky.points import PointSky as PointSky
+from .sky.sums import SumSky as SumSky
 from .units import Direction as Direction
 from .visibilities import Visibilities as Visibilities
 from .visibilities import VisibilitySet as VisibilitySet

@@ -207,6 +207,8 @@ def cell_seconds(problem: Problem) -> float:
     stations, sources = problem.at.shape[2], problem.sky.count
     parts = sum(term.phasors() for term in problem.chain.parts)
     listed = points_of(problem.sky)
+    if problem.sky.kind == "sum":
+        return sum(cell_seconds(one) for one in problem.members().values())
     shaped = 0 if problem.sky.kind == "image" else sources if listed is None else int(listed.gaussian.sum())
     matrices = 0.1e-6 + 0.35e-6 * len(problem.chain.terms)
     return (

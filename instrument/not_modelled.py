@@ -26,15 +26,16 @@ NODES, WEIGHTS = np.polynomial.laguerre.laggauss(3)  # rings of a two-dimensiona
 
 def not_modelled(problem: Problem, scale_jy: float) -> list[Item]:
     """Every such item; those whose `bound` is not 0 are part of the bound of a plan, relative to `scale_jy`."""
-    return [
-        *_smearing(problem), *_extended(problem, scale_jy), *_no_horizon(problem), *_zenith(problem), *_doubts(problem),
-    ]  # fmt: skip
+    out = _smearing(problem)
+    for name, one in problem.members().items():
+        found = [*_extended(one, scale_jy), *_no_horizon(one), *_zenith(one), *_doubts(one)]
+        out += [item.of(name) for item in found]
+    return out
 
 
 def _doubts(problem: Problem) -> list[Item]:
-    """What spectra make of the sources at these frequencies, and what of their file was not read."""
-    sky = points_of(problem.sky)
-    return [] if sky is None else [Item(name, text) for name, text in sky.doubts(problem.at.freq_hz).items()]
+    """What a sky says of itself: spectra taken far, what of a file was not read, how images were made."""
+    return [Item(name, text) for name, text in problem.sky.doubts(problem.at.freq_hz).items()]
 
 
 def _smearing(problem: Problem) -> list[Item]:

@@ -12,10 +12,11 @@ from instrument.observe.directions import LIGHT
 from instrument.observe.sampling import Sampling
 from instrument.plan import Item, count_of
 from instrument.predict.base import Problem
-from instrument.predict.rounding import known_gain
-from instrument.sky.base import power
-from instrument.sky.image import ImageSky
+from instrument.predict.rounding import known_gain, total_flux
+from instrument.sky.base import PlacedSky, power
+from instrument.sky.pixels import PixelSky
 from instrument.sky.points import PointSky, points_of
+from instrument.sky.sums import SumSky
 from instrument.units import Bool, Float
 
 KINDS = ("I", "Q", "U", "V")
@@ -58,18 +59,40 @@ def simplify_chain(chain: Chain, at: Sampling, budget: Budget, kept: list[Item],
 
 def simplify_sky(full: Problem, chain: Chain, budget: Budget, left_out: list[Item]) -> Problem:
     """Drop directions that give exactly nothing, and with a tolerance the faintest, by flux times the peak of |J|^2."""
+    if full.sky.kind == "sum":
+        return _each_member(full, chain, budget, left_out)
     problem, sky = replace(full, chain=chain), points_of(full.sky)
     if sky is not None:
         return _fewer(problem, sky, budget, left_out)
     there = full.sky.nonzero(full.at.freq_hz)
     if not any(there):
         raise InputError(f"the sky ({full.sky.size}) has no flux at all")
-    if isinstance(full.sky, ImageSky) and (dark := len(full.sky.grid) - full.sky.count):
+    if isinstance(full.sky, PixelSky) and (dark := len(full.sky.grid) - full.sky.count):
         left_out.append(Item(count_of(dark, "pixel"), "no flux"))
     if not all(there):
         zero = ", ".join(kind for kind, has in zip(KINDS, there, strict=True) if not has)
         left_out.append(Item(f"{zero} of the sky", "zero in every direction"))
     return problem
+
+
+def _each_member(full: Problem, chain: Chain, budget: Budget, left_out: list[Item]) -> Problem:
+    """A sum of skies without members that give nothing, and of the others what each needs; bounds are of all flux."""
+    total, members = total_flux(full), full.members()
+    kept: dict[str, PlacedSky] = {}
+    for k, (name, one) in enumerate(members.items()):
+        share, said = total_flux(one) / total if total else 0.0, list[Item]()
+        part = budget.left / (len(members) - k)
+        own = Budget(part / share if share else 0.0, 0.0)
+        try:
+            kept[name] = simplify_sky(one, chain, own, said).sky
+        except InputError:
+            left_out.append(Item(name, "no flux, or never above the antenna planes"))
+            continue
+        budget.take(part - own.left * share)
+        left_out += [item._replace(bound=item.bound * share).of(name) for item in said]
+    if not kept:
+        raise InputError("nothing of the sky is ever above the antenna planes, or it has no flux at all")
+    return replace(full, chain=chain).of(SumSky(skies=kept))
 
 
 def _fewer(full: Problem, sky: PointSky, budget: Budget, left_out: list[Item]) -> Problem:

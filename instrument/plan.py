@@ -31,6 +31,10 @@ class Item(NamedTuple):
     reason: str
     bound: float = 0.0
 
+    def of(self, member: str) -> Item:
+        """The same of a member of a sum of skies, by its name."""
+        return self._replace(name=f"{member}: {self.name}") if member else self
+
 
 @checked
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from instrument.errors import InputError, RefusedError, did_you_mean, warn
+from instrument.errors import InputError, RefusedError, warn
 from instrument.memory import afford, usable
 from instrument.model import Instrument, warn_outside_band
 from instrument.not_modelled import not_modelled
@@ -18,8 +18,8 @@ from instrument.observe.sampling import Sampling
 from instrument.omissions import Budget, simplify_chain, simplify_sky, w_term, within
 from instrument.plan import Item, Plan
 from instrument.predict.base import Prepared, Problem, Work
+from instrument.predict.choice import cheapest
 from instrument.predict.rounding import rounding, total_flux, unknown_peaks
-from instrument.registry import available, load
 from instrument.sky.base import Sky
 from instrument.units import si_prefix, to_si
 
@@ -47,6 +47,7 @@ def make_plan(
     _refuse_below(tolerance, rounded)
     found = _decided(full, tolerance, rounded, engine)
     problem, ready = found.problem, found.ready
+    said = ready.omission[0] or ready.lines  # the bound stands there
     limit = memory_limit(memory)
     shape, work, peak = _blocks(ready, workers, limit)
     last = Item(_rounding_name(problem), "", rounding(problem, scale_jy))
@@ -69,7 +70,7 @@ def make_plan(
         memory=peak,
         limit=limit,
         tolerance=tolerance,
-        bounds=(Item(found.label, "", ready.bound), last) if ready.bound and not ready.omission[0] else (last,),
+        bounds=(Item(found.label, "", ready.bound), last) if ready.bound and not said else (last,),
         scale_jy=scale_jy,
         seconds=work.seconds / workers,
         next_decade=_next_decade(full, tolerance, rounded, engine, work.seconds),
@@ -97,10 +98,12 @@ def _decided(full: Problem, tolerance: float, rounded: float, engine: str | None
     budget = Budget(tolerance, rounded) if tolerance > 0 else Budget(0.0, 0.0)
     chain = simplify_chain(full.chain, full.at, budget, kept, left_out)
     problem = simplify_sky(full, chain, budget, left_out)
-    ready, label, refused = _choose(problem, engine, budget)
+    ready, label, refused = cheapest(problem, engine, budget.left)
     if ready.omission[0]:
         left_out.append(Item(*ready.omission, ready.bound))
-    return Decided(problem, ready, label, tuple(kept), tuple(left_out), tuple(refused), budget.left)
+    kept += [Item(*line) for line in ready.lines]
+    said = tuple(Item(*pair) for pair in refused)
+    return Decided(problem, ready, label, tuple(kept), tuple(left_out), said, budget.left)
 
 
 def _next_decade(full: Problem, tolerance: float, rounded: float, engine: str | None, seconds: float) -> str:
@@ -183,33 +186,6 @@ def _say_what_exceeds(tolerance: float, rounded: float, unmodelled: list[Item]) 
         said = "; ".join(f"{i.name}: {i.reason}, {i.bound:.1e}" for i in extra)
         text = f"tolerance = {tolerance:g} is not kept by what is not modelled ({said}): split it into smaller sources"
         warn(text)
-
-
-def _choose(problem: Problem, name: str | None, budget: Budget) -> tuple[Prepared, str, list[Item]]:
-    """The engine that is cheapest once prepared, with its name, and the engines that refuse."""
-    plugins = available("engines")
-    if name is not None and name not in plugins:
-        raise InputError(f"no engine is called '{name}': {did_you_mean(name, plugins)}")
-    fit: list[tuple[float, str, Prepared]] = []
-    refused = []
-    for label, plugin in plugins.items():
-        if plugin.broken:
-            refused.append(Item(label, plugin.broken))
-            continue
-        engine = load("engines", label)
-        if why := engine.refuses(problem):
-            refused.append(Item(label, why))
-        elif name in (None, label):
-            try:
-                ready = engine.prepare(problem, budget.left)
-                fit.append((ready.work().seconds, label, ready))
-            except RefusedError as error:
-                refused.append(Item(label, str(error)))
-    if fit:
-        _, label, ready = min(fit, key=lambda entry: entry[0])
-        return ready, label, refused
-    reasons = "; ".join(f"{i.name}: {i.reason}" for i in refused if name in (None, i.name))
-    raise RefusedError(f"no engine serves this scene ({reasons})")
 
 
 def memory_limit(memory: Any) -> float:

@@ -7,7 +7,8 @@ import numpy as np
 from astropy import units as u
 
 import instrument
-from instrument.image.mocks import FINE, leaked, noise_cube, polarized_screens
+from instrument.image.mocks import leaked, noise_cube, polarized_screens
+from instrument.sky.screens import FINE
 
 # 27 screens of which that at 1.2 rad/m^2 stands out; steep, so that 7.1 mK are mostly on scales beyond a degree
 SCREENS = FINE.with_fields(width=0.5, floor=0.05, slope=3.5, uv_range=(10.0, 800.0))

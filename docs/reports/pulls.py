@@ -305,7 +305,8 @@ def scores(draws: int, seed: int = 0, removers: tuple[tuple[str, float], ...] = 
     Leakage of 7.1 mK, 32 x 32 x 81; where a lower bound is said no error is printed and none is counted.
     """
     import instrument
-    from instrument.image.mocks import FINE, leaked, noise_cube, polarized_screens
+    from instrument.image.mocks import leaked, noise_cube, polarized_screens
+    from instrument.sky.screens import FINE
 
     frequencies = np.linspace(134, 166, 81) * u.MHz
     like = leaked(polarized_screens(pixels=32, pixel=2 * u.arcmin, frequencies=frequencies, screens=FINE, seed=1))

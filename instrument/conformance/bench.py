@@ -24,6 +24,7 @@ from instrument.predict.base import Problem
 from instrument.sky.base import PlacedSky
 from instrument.sky.image import ImageSky
 from instrument.sky.points import PointSky
+from instrument.sky.sums import SumSky
 from instrument.units import Complex, Direction, Float
 
 # Two evaluations of one formula in blocks of different size round differently: 1e-14 for elements, 1e-11 for the
@@ -259,6 +260,9 @@ def problems() -> dict[str, Problem]:
         "points and Gaussians, phased stations": _problem(at, Chain(*receivers, station, Parallactic()), shaped),
         "a sky that is not a list": _problem(at, Chain(_Dipole(), Parallactic()), _NotAList(inner=points)),
         "an image, no Jones term": _problem(at, Chain(), random_image(at)),
+        "a sum of points and an image": _problem(
+            at, Chain(*receivers, station, Parallactic()), SumSky(skies={"stars": shaped, "image": random_image(at)})
+        ),
         "an image, phased stations": _problem(at, Chain(*receivers, station, Parallactic()), random_image(at)),
     }
 

@@ -15,14 +15,12 @@ from instrument.image.channels import channel_index, in_band
 from instrument.image.common_beam import at_common_beam
 from instrument.image.cube_file import write_cube
 from instrument.image.psf import Psf
-from instrument.observe.directions import LIGHT
 from instrument.observe.grid import ImageGrid
 from instrument.shown import short_repr
 from instrument.sky.image import ImageSky
+from instrument.sky.made import jy_per_k
 from instrument.units import Direction, Float, one_si, to_si
 
-BOLTZMANN = 1.380649e-23  # J/K
-JY = 1e-26  # W m^-2 Hz^-1
 Unit = Literal["Jy/beam", "Jy/pixel", "K"]
 
 
@@ -110,8 +108,7 @@ class StokesCube:
             raise InputError("a cube in Jy/beam is no sky: its pixels are blurred; give one in Jy/pixel or K")
         jansky = np.asarray(self.data, float)
         if self.unit == "K":
-            per_k = 2 * BOLTZMANN * self.freq_hz**2 / LIGHT**2 * self.pixel_rad**2 / JY
-            jansky = jansky * per_k[:, None, None, None]
+            jansky = jansky * jy_per_k(self.freq_hz, self.pixel_rad**2)[:, None, None, None]
         return ImageSky(grid=self.grid, stokes=jansky, frequencies=self.freq_hz * u.Hz)
 
     def to_kelvin(self) -> StokesCube:
@@ -134,7 +131,7 @@ class StokesCube:
                 f"the solid angle of the PSF in {listing(wrong)} is {show(omega[wrong])} sr: it has no K; "
                 "leave these channels out, or give psf=Psf.gaussian(major, minor, angle)"
             )
-        factor = JY * LIGHT**2 / (2 * BOLTZMANN * self.freq_hz**2 * np.where(usable, omega, np.nan))
+        factor = 1 / jy_per_k(self.freq_hz, np.where(usable, omega, np.nan))
         exact = np.result_type(self.data, np.float32)  # a float32 cube stays one
         return self._with(data=self.data * factor[:, None, None, None].astype(exact), unit="K")
 

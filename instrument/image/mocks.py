@@ -7,73 +7,18 @@ spectrum of Bernardi et al. (2009, A&A 500, 965) and noise of 60 mK in 600 h.
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import Field
 
 from instrument.checked import checked
-from instrument.component import Component
 from instrument.errors import InputError
 from instrument.image.cube import StokesCube
 from instrument.image.psf import Psf
 from instrument.memory import afford
 from instrument.observe.directions import LIGHT
-from instrument.units import Complex, Float, Radians, Seed, direction, to_si
-
-ARCMIN = np.pi / 180 / 60
-REFERENCE = 150e6  # Hz
-CHUNK = 16384  # pixels whose Faraday spectra are searched at once
-Real32 = NDArray[np.float32]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-
-
-class Screens(Component):
-    """Faraday screens that emit: depths in rad/m², each with brightness exp(-(phi - brightest)² / 2 width²) + floor.
-
-    Each emits a complex Gaussian field of angular power l^-slope between `uv_range` (wavelengths), and its Faraday
-    depth varies over the field by a real one of rms `ripple` (rad/m²) and slope `ripple_slope`. `fwhm` is the beam at
-    150 MHz, the same in all channels or (`chromatic`) as wide as the wavelength. Brightness goes as nu^spectral_index.
-    The largest |F(phi)| becomes `peak_k` kelvin and lies at `brightest`.
-    """
-
-    depths: tuple[Finite, ...] = (-1.5, -0.75, 0.0, 0.6, 1.2, 1.8, 2.5, 3.3, 4.1, 5.0)
-    brightest: Finite = 1.2
-    width: Positive = 1.0
-    floor: NotNegative = 0.15
-    slope: Finite = 2.2
-    uv_range: tuple[NotNegative, Positive] = (30.0, 800.0)
-    fwhm: Annotated[Radians, Field(ge=0)] = 4.3 * ARCMIN
-    chromatic: bool = False
-    ripple: NotNegative = 0.15
-    ripple_slope: Finite = 8 / 3
-    spectral_index: Finite = -2.55
-    peak_k: Positive = 5.0
-
-    @property
-    def weights(self) -> Float:
-        """Brightness of each screen (K,)."""
-        off = (np.array(self.depths) - self.brightest) / self.width
-        return np.asarray(np.exp(-0.5 * off**2) + self.floor)
-
-    def beam_rad(self, freq_hz: Float) -> Float:
-        """Full width of the beam at half maximum (F,)."""
-        return np.asarray(self.fwhm * (REFERENCE / freq_hz if self.chromatic else np.ones(len(freq_hz))))
-
-
-TEN = Screens()  # the recipe
-FINE = Screens(
-    depths=tuple(np.linspace(-1.5, 5, 27).tolist()),
-    width=0.55,
-    floor=0.04,
-    uv_range=(0.0, 800.0),
-    fwhm="3 arcmin",
-    chromatic=True,
-    ripple=0.0,
-)
+from instrument.sky.screens import TEN, Emission, Screens, filtered, highest, turn_of
+from instrument.units import Float, Seed, direction, to_si
 
 
 @checked
@@ -101,25 +46,14 @@ def polarized_screens(
     step = float(to_si(pixel, "rad", "pixel"))
     if pixels < 4 or not step > 0 or not (np.isfinite(freq).all() and (freq > 0).all() and len(freq)):
         raise InputError(f"pixels = {pixels} (4 or more), pixel = {pixel}, frequencies: all must be above 0")
-    if not screens.depths or not screens.uv_range[0] < screens.uv_range[1]:
-        raise InputError(f"screens need depths and a uv_range that grows, got {screens.depths}, {screens.uv_range}")
     # the cube, and fields of every screen in complex64
-    size = float(pixels) ** 2 * (16.0 * len(freq) + 8.0 * (2 * len(screens.depths) + 4))
+    size = 16.0 * pixels**2 * len(freq) + screens.bytes_of(pixels)
     afford(size, f"a cube of {len(freq)} channels of {pixels} x {pixels} pixels", "ask for fewer")
-    uv, rng = _uv(pixels, step), np.random.default_rng(seed)
-    if not ((uv > 0) & (uv >= screens.uv_range[0]) & (uv <= screens.uv_range[1])).any():
-        raise InputError(f"{pixels} pixels have no cell within uv_range = {screens.uv_range}: take more or larger ones")
-    emitted = [_random_field(rng, uv, screens.slope, screens.uv_range) for _ in screens.depths]
-    emitted = [_unit(e if screens.chromatic else _filtered(e, _transfer(uv, screens.fwhm))) for e in emitted]
-    ripples = [
-        np.float32(screens.ripple) * _unit(_random_field(rng, uv, screens.ripple_slope, (0, screens.uv_range[1])).real)
-        for _ in (screens.depths if screens.ripple else ())
-    ]
+    screens.check(pixels, step)
+    fields = Emission.draw(screens, pixels, step, seed)
     data = np.zeros((len(freq), 4, pixels, pixels), np.float32)
-    for plane, hertz, width in zip(data, freq, screens.beam_rad(freq), strict=True):
-        p = _polarization(screens, emitted, ripples, (LIGHT / hertz) ** 2)
-        p = _filtered(p, _transfer(uv, float(width))) if screens.chromatic else p
-        p *= np.float32((hertz / REFERENCE) ** screens.spectral_index)
+    for plane, hertz in zip(data, freq, strict=True):
+        p = fields.at(hertz).reshape(pixels, pixels)
         plane[1], plane[2] = p.real, p.imag
     _calibrate(data, (LIGHT / freq) ** 2, screens)
     psf = Psf.gaussian(screens.beam_rad(freq) * u.rad) if screens.fwhm else None
@@ -198,82 +132,22 @@ def noise_cube(like: StokesCube, sigma: Any, psf_shaped: bool = False, seed: See
                 )
             amplitude /= np.sqrt((amplitude**2).mean())
             for k in (0, 2):  # two real fields in one transform: the filter is even
-                both = _filtered(planes[k] + 1j * planes[k + 1], amplitude)
+                both = filtered(planes[k] + 1j * planes[k + 1], amplitude)
                 planes[k], planes[k + 1] = both.real, both.imag
         planes *= np.float32(rms)
     return like.with_data(data)
 
 
-def _uv(pixels: int, pixel_rad: float) -> Float:
-    """Length of the baseline of every cell, wavelengths (N, N)."""
-    u = np.fft.fftfreq(pixels, pixel_rad)
-    return np.asarray(np.hypot(u[:, None], u))
-
-
-def _transfer(uv: Float, fwhm_rad: float) -> Float:
-    """Transform of a round Gaussian of peak transfer 1."""
-    return np.asarray(np.exp(-((np.pi * fwhm_rad * uv) ** 2) / (4 * np.log(2))))
-
-
-def _random_field(rng: np.random.Generator, uv: Float, slope: float, uv_range: tuple[float, float]) -> Complex:
-    """Complex Gaussian field of power uv^-slope within a range, complex64."""
-    from ducc0 import fft
-
-    use = (uv > 0) & (uv >= uv_range[0]) & (uv <= uv_range[1])
-    amplitude = np.where(use, np.where(uv > 0, uv, 1.0) ** (-slope / 2), 0.0).astype(np.float32)
-    white = rng.standard_normal((*uv.shape, 2), dtype=np.float32).view(np.complex64)[..., 0]
-    return np.asarray(fft.c2c(white * amplitude, forward=False, nthreads=0))
-
-
-def _unit(field: Any) -> Any:
-    return field / np.float32(np.sqrt(np.mean(np.abs(field) ** 2, dtype=np.float64)))
-
-
-def _filtered(field: Complex, transfer: Float) -> Complex:
-    from ducc0 import fft
-
-    cells = fft.c2c(field, nthreads=0)
-    cells *= transfer.astype(np.float32)
-    return np.asarray(fft.c2c(cells, forward=False, inorm=2, nthreads=0))
-
-
-def _polarization(screens: Screens, emitted: list[Complex], ripples: list[Real32], lambda2: float) -> Complex:
-    """Sum of the screens at one wavelength, at the brightness of 150 MHz, complex64 (N, N)."""
-    total = np.zeros_like(emitted[0])
-    for k, (e, phi, weight) in enumerate(zip(emitted, screens.depths, screens.weights, strict=True)):
-        turned = e * np.complex64(weight * np.exp(2j * phi * lambda2))
-        if ripples:
-            phase = np.float32(2 * lambda2) * ripples[k]  # a few rad: float32 is enough
-            turn = np.empty_like(turned)
-            turn.real, turn.imag = np.cos(phase), np.sin(phase)
-            turned *= turn
-        total += turned
-    return total
-
-
-def _calibrate(data: Real32, lambda2: Float, screens: Screens) -> None:
+def _calibrate(data: Any, lambda2: Float, screens: Screens) -> None:
     """Turn and scale Q and U in place so that the peak of |F(phi)| is where and what it should be."""
-    n = len(lambda2)
-    off = lambda2 - lambda2.mean()
-    depths = np.arange(min(screens.depths) - 2, max(screens.depths) + 2.05, 0.1) if n > 1 else np.zeros(1)
-    kernel = (np.exp(-2j * np.multiply.outer(depths, off)) / n).astype(np.complex64)
-    p = data[:, 1:3].reshape(n, 2, -1)
-    highest = np.concatenate(
-        [
-            np.abs(kernel @ (p[:, 0, i : i + CHUNK] + 1j * p[:, 1, i : i + CHUNK])).max(axis=0)
-            for i in range(0, p.shape[2], CHUNK)
-        ]
-    )
+    p = data[:, 1:3].reshape(len(lambda2), 2, -1)
+    found = highest(screens, lambda2, lambda part: p[:, 0, part] + 1j * p[:, 1, part], p.shape[2])
     # between steps of 0.1 a peak stands up to 0.2 % higher: all that come near are looked at in steps of 0.005
-    near = np.flatnonzero(highest > 0.99 * highest.max())
-    spectra = p[:, 0, near].astype(float) + 1j * p[:, 1, near]
-    fine = np.arange(depths[0], depths[-1] + 0.002, 0.005) if n > 1 else depths
-    found = np.abs(np.exp(-2j * np.multiply.outer(fine, off)) @ spectra) / n
-    i, _ = np.unravel_index(np.argmax(found), found.shape)
-    shift = screens.brightest - fine[i] if n > 1 else 0.0
+    near = np.flatnonzero(found > 0.99 * found.max())
+    factor, shift = turn_of(screens, lambda2, p[:, 0, near].astype(float) + 1j * p[:, 1, near])
     for plane, l2 in zip(data, lambda2, strict=True):
         q, u = plane[1].copy(), plane[2]
-        turn = screens.peak_k / found.max() * np.exp(2j * shift * l2)
+        turn = factor * np.exp(2j * shift * l2)
         c, s = np.float32(turn.real), np.float32(turn.imag)
         plane[1], plane[2] = c * q - s * u, s * q + c * u
 

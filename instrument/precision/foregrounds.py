@@ -11,8 +11,9 @@ from instrument.analyze.power.signal import Signal21cm
 from instrument.errors import InstrumentWarning
 from instrument.foreground.loss import signal_loss
 from instrument.image.cube import StokesCube
-from instrument.image.mocks import FINE, leaked, noise_cube, polarized_screens
+from instrument.image.mocks import leaked, noise_cube, polarized_screens
 from instrument.precision.contest import RIGHT, Contest, Entry, Form, Trial
+from instrument.sky.screens import FINE
 
 PIXELS = (48, 96)  # of the quick form and of the full one
 LEAKED, NOISE = 7.1e-3, 10e-3  # K, rms of a voxel in Stokes I

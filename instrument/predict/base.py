@@ -63,11 +63,21 @@ class Problem:
 
     def parts(self, most: int = CHUNK) -> Iterator[Problem]:
         """The same in pieces of at most so many directions each, whose sums add up; each towards all of its own."""
-        if self.sky.kind != "image" and (self.sky.count <= most or self.at.seen is not None):
+        if self.sky.kind not in ("image", "sum") and (self.sky.count <= most or self.at.seen is not None):
             yield self
             return
         for sky in self.sky.parts(most, self.at.freq_hz):
             yield replace(self, sky=sky, at=self.at.towards(*sky.directions()))
+
+    def of(self, sky: PlacedSky) -> Problem:
+        """The same of another sky."""
+        return replace(self, sky=sky, at=self.at.towards(*sky.outline()))
+
+    def members(self) -> dict[str, Problem]:
+        """One for each member of a sum of skies, by its name; itself, without a name, where the sky is none."""
+        if self.sky.kind != "sum":
+            return {"": self}
+        return {name: self.of(sky) for name, sky in self.sky.members().items()}
 
     def visibilities(self, data: Complex) -> Visibilities:
         """Data (T, F, B, 2, 2) with the coordinates of the problem."""
@@ -130,6 +140,11 @@ class Prepared(ABC):
     bound: float = 0.0
     atom: tuple[int, int] = (1, 1)
     omission: tuple[str, str] = ("", "")  # what the bound is of, and how it is left out, for a plan to say
+
+    @property
+    def lines(self) -> tuple[tuple[str, str, float], ...]:
+        """What else a plan says is kept: a thing, how, and the part of the bound that is its; of many engines, each."""
+        return ()
 
     @abstractmethod
     def sums(self, times: slice, channels: slice, pairs: tuple[Int, Int] | None = None) -> Complex:

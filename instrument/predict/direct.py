@@ -11,6 +11,7 @@ from instrument import mat2
 from instrument.observe.directions import LIGHT
 from instrument.predict.base import CHUNK, Blockwise, Predictor, Prepared, Problem, Work
 from instrument.predict.operator import ImageOperator
+from instrument.sky.image import ImageSky
 from instrument.units import Complex, Float, Int
 
 
@@ -30,9 +31,9 @@ class Direct(Predictor):
         stations, sources = problem.at.shape[2], problem.sky.count
         units = times * channels * baselines * sources
         # measured, 4 to 59 stations: four Jones matrices and terms of one in all, directions in the axes of a station
-        held = times * min(sources, CHUNK) * (channels * (275 * stations + 110) + 85 * stations)
-        held += 64 * times * channels * baselines
-        return Work(150.0 * units, 0.0, float(held), 150e-9 * units + 1e-4 * baselines)
+        held = float(times) * min(sources, CHUNK) * (channels * (275 * stations + 110) + 85 * stations)
+        held += 64 * times * channels * baselines + problem.sky.held_bytes(channels)
+        return Work(150.0 * units, 0.0, held, 150e-9 * units + 1e-4 * baselines)
 
     def sums(self, problem: Problem) -> Complex:
         """Visibilities in Jy, complex (T, F, B, 2, 2)."""
@@ -78,7 +79,7 @@ class DirectImages(ImageOperator):
         from astropy import units as u
 
         block = self.block(times, channels, pairs)
-        sky = self.sky.with_fields(stokes=images, frequencies=block.at.freq_hz * u.Hz)
+        sky = ImageSky(grid=self.sky.grid, stokes=images, frequencies=block.at.freq_hz * u.Hz)
         return replace(block, sky=sky)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 
 from instrument.predict.base import Prepared
-from instrument.sky.image import ImageSky
+from instrument.sky.pixels import PixelSky
 from instrument.units import Complex, Float, Int
 
 
@@ -17,10 +17,10 @@ class ImageOperator(Prepared):
     """
 
     @property
-    def sky(self) -> ImageSky:
+    def sky(self) -> PixelSky:
         """The sky of the problem, an image."""
         sky = self.problem.sky
-        assert isinstance(sky, ImageSky)  # or it would have been refused
+        assert isinstance(sky, PixelSky)  # or it would have been refused
         return sky
 
     @abstractmethod

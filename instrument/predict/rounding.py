@@ -15,7 +15,7 @@ from instrument.mat2 import UNIT
 from instrument.observe.directions import LIGHT
 from instrument.observe.sampling import Sampling
 from instrument.predict.base import CHUNK, Problem
-from instrument.sky.image import ImageSky
+from instrument.sky.pixels import PixelSky
 from instrument.sky.points import points_of
 from instrument.sky.rounding import brightness_rounding, flux
 from instrument.sky.sources import FLUX_CELLS
@@ -31,7 +31,12 @@ def total_flux(problem: Problem) -> float:
 
 
 def rounding(problem: Problem, scale_jy: float) -> float:
-    """Bound on the rounding of any visibility, relative to `scale_jy`."""
+    """Bound on the rounding of any visibility, relative to `scale_jy`; of a sum of skies that of each and of adding."""
+    if problem.sky.kind == "sum":
+        members = list(problem.members().values())
+        return sum(rounding(one, scale_jy) for one in members) + len(members) * UNIT * known_gain(
+            problem.chain, problem.at
+        )
     gain = known_gain(problem.chain, problem.at)
     relative = gain * (_phase(problem) + UNIT * (2 * _added(problem) + 40)) + _jones(problem)
     largest = 0.0
@@ -132,7 +137,7 @@ def _nearest(problem: Problem) -> tuple[Float, Float]:
     """
     at, sky = problem.at, problem.sky
     least = np.array([at.rising.zenith, at.rising.horizon])
-    if not isinstance(sky, ImageSky):
+    if not isinstance(sky, PixelSky):
         return least[0], least[1]
     reach = sky.reach_rad
     near = np.flatnonzero(np.any(least < 2 * reach, axis=0))

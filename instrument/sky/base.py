@@ -47,11 +47,11 @@ class Sky(Component):
 class PlacedSky(Sky):
     """Directions on the sky (S,) and their brightness matrices (T, F, S, 2, 2), length 1 where constant.
 
-    `kind` says which engines it is for: "points" is a list of sources (`PointSky`), "image" has a grid (`ImageSky`),
-    "other" is known by its directions and brightness alone, which `direct` takes.
+    `kind` says which engines it is for: "points" is a list of sources (`PointSky`), "image" has a grid (`PixelSky`),
+    "sum" has members (`SumSky`), "other" is known by its directions and brightness alone, which `direct` takes.
     """
 
-    kind: ClassVar[Literal["points", "image", "other"]] = "other"
+    kind: ClassVar[Literal["points", "image", "sum", "other"]] = "other"
 
     def about(self, centre: Direction) -> PlacedSky:
         """Itself."""
@@ -82,6 +82,18 @@ class PlacedSky(Sky):
     def nonzero(self, freq_hz: Float) -> tuple[bool, bool, bool, bool]:
         """Which of I, Q, U, V differ from zero in any direction and channel; the cautious answer is all."""
         return (True, True, True, True)
+
+    def doubts(self, freq_hz: Float) -> dict[str, str]:
+        """What a plan should say of it at some frequencies, under "not modelled": a thing, and what is so about it."""
+        return {}
+
+    def held_bytes(self, channels: int) -> float:
+        """What is allocated for its brightness while so many channels are summed, beside what it holds anyway."""
+        return 0.0
+
+    def members(self) -> dict[str, PlacedSky]:
+        """The skies that it is a sum of, by name; itself, without a name, where it is none."""
+        return {"": self}
 
     @property
     def count(self) -> int:

@@ -9,8 +9,9 @@ from instrument.mat2 import UNIT
 from instrument.observe.directions import LIGHT
 from instrument.observe.sampling import Sampling
 from instrument.sky.base import PlacedSky, polarized, power
-from instrument.sky.image import ImageSky
+from instrument.sky.pixels import PixelSky
 from instrument.sky.points import PointSky, points_of
+from instrument.sky.sums import side_by_side
 from instrument.units import Float
 
 
@@ -19,8 +20,10 @@ def flux(sky: PlacedSky, at: Sampling) -> Float:
     listed = points_of(sky)
     if listed is not None:
         return power(listed.stokes(at.freq_hz))[None]
-    if isinstance(sky, ImageSky):
+    if isinstance(sky, PixelSky):
         return sky.cells_jy(at.freq_hz)[None]
+    if sky.kind == "sum":
+        return np.asarray(side_by_side([flux(one, at.towards(*one.outline())) for one in sky.members().values()]))
     return power(np.asarray(stokes(sky.brightness(at)).real))
 
 

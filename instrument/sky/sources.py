@@ -36,7 +36,7 @@ PER_SOURCE = ("ra_rad", "dec_rad", "stokes_jy", *OPTIONAL)
 class Sources(PlacedSky):
     """The sources of a `PointSky`, which says what its fields mean, and what they are at some frequencies."""
 
-    kind: ClassVar[Literal["points", "image", "other"]] = "points"
+    kind: ClassVar[Literal["points", "image", "sum", "other"]] = "points"
     names: tuple[str, ...]
     patches: tuple[str, ...] = ()
     ra_rad: Column

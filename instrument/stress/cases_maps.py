@@ -10,10 +10,11 @@ import numpy as np
 from instrument.errors import InputError, InstrumentWarning
 from instrument.image.beam_leakage import leaked_through
 from instrument.image.cube import StokesCube
-from instrument.image.mocks import Screens, leaked, noise_cube, polarized_screens
+from instrument.image.mocks import leaked, noise_cube, polarized_screens
 from instrument.image.psf import Psf, fit_psf
 from instrument.model import Composed
 from instrument.observe.directions import offset
+from instrument.sky.screens import Screens
 from instrument.stress.bench import small_array
 from instrument.stress.case import Answer, both, case, claim, held
 from instrument.stress.cases_exact import Slanted

@@ -19,7 +19,8 @@ from instrument.analyze.power.signal import Signal21cm
 from instrument.foreground.linear import covariance
 from instrument.foreground.maps import StokesMaps
 from instrument.foreground.noise import noise_power
-from instrument.image.mocks import FINE, leaked, noise_cube, polarized_screens
+from instrument.image.mocks import leaked, noise_cube, polarized_screens
+from instrument.sky.screens import FINE
 
 SCREENS = FINE.with_fields(width=0.5, floor=0.05, slope=3.5, uv_range=(10.0, 800.0))
 ADAPTED = ("pca", "gmca", "gpr")

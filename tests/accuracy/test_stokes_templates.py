@@ -8,7 +8,8 @@ from instrument import InputError, Outcome, StokesCube, StokesMaps, load, signal
 from instrument.errors import PluginError
 from instrument.foreground.base import ForegroundRemover
 from instrument.foreground.maps import Usable
-from instrument.image.mocks import FINE, leaked, noise_cube, polarized_screens
+from instrument.image.mocks import leaked, noise_cube, polarized_screens
+from instrument.sky.screens import FINE
 
 LONG = pytest.mark.long
 SMALL = {"pixels": 48, "pixel": 2 * u.arcmin, "screens": FINE, "seed": 1}

@@ -77,6 +77,20 @@ SETTINGS: dict[tuple[str, ...], list[dict[str, Any]]] = {
     ],
     ("stages", "image"): [{"imager": instrument.Imager(pixels=32, pixel=10 * u.arcmin)}],
     ("stages", "analyze"): [{}, {"products": ("leakage", "spectrum-2d")}],
+    ("skies", "galaxy"): [
+        {
+            "pixels": 8,
+            "pixel": 40 * u.arcmin,
+            "screens": {"uv_range": (5, 800)},
+            "noise": 1 * u.K,
+            "discs": 2,
+            "disc": 1 * u.deg,
+        }
+    ],
+    ("skies", "sum"): [
+        {"near": {"kind": "grid", "shape": (2, 2)}, "far": {"kind": "faraday", "count": 9}},
+        {"stars": {"kind": "random", "count": 7}, "both": {"kind": "sum", "a": {"kind": "grid", "shape": (3, 1)}}},
+    ],
     ("skies", "random"): [{"polarization": 0.3, "circular": 0.1, "scatter": 0.2, "seed": 5}],
     ("skies", "mock-3c196"): [{"components": True, "scatter": 0.1}],
     ("skies", "catalogue"): [{"path": "3c196_pandey.skymodel"}, {"path": "mock_150mhz.csv", "brightest": 50}],

@@ -11,7 +11,8 @@ from instrument import Analyzer, CubeAnalysis, InputError, Psf, Signal21cm, Stok
 from instrument.analyze.cube_checks import check_faraday
 from instrument.cli import main
 from instrument.errors import InstrumentWarning
-from instrument.image.mocks import FINE, polarized_screens
+from instrument.image.mocks import polarized_screens
+from instrument.sky.screens import FINE
 
 FREQ = 140e6 + 0.5e6 * np.arange(33)
 PIXEL = 4 * u.arcmin

@@ -131,6 +131,8 @@ def calls():
         ("ImageGrid", ins.ImageGrid, {"pixels": 4, "pixel": 1 * u.arcmin, "centre": CENTRE}),
         ("ImageSky", ins.ImageSky, {
             "grid": w.pixels.grid, "stokes": np.ones((1, 4, 4, 4)), "frequencies": [150] * u.MHz}),
+        ("SumSky", ins.SumSky, {"skies": {"points": w.sky, "pixels": w.pixels}}),
+        ("SumSky.about", ins.SumSky(skies={"a": w.sky}).about, {"centre": ins.Direction(2.1, 0.8)}),
         ("ImageSky.about", w.pixels.about, {"centre": ins.Direction(2.1, 0.8)}),
         ("ImageSky.planes", w.pixels.planes, {"freq_hz": np.array([1.5e8])}),
         ("ImageSky.total_jy", w.pixels.total_jy, {"freq_hz": np.array([1.5e8])}),

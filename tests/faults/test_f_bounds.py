@@ -165,12 +165,12 @@ class Coarse(Predictor):
 
 
 def test_f2_the_tolerance_reaches_the_engine_and_its_bound_is_summed(monkeypatch):
-    from instrument import planner
+    from instrument.predict import choice
     from instrument.registry import Plugin, available
 
     known = dict(available("engines"))
-    monkeypatch.setattr(planner, "available", lambda kind: {"coarse": known["direct"]})
-    monkeypatch.setattr(planner, "load", lambda kind, name: Coarse())
+    monkeypatch.setattr(choice, "available", lambda kind: {"coarse": known["direct"]})
+    monkeypatch.setattr(choice, "load", lambda kind, name: Coarse())
     assert isinstance(known["direct"], Plugin)
     plan = scene(PointSky.at(near([[0, 0], [0.02, 0.01]]), [1.0, 3.0])).plan(tolerance=1e-3)
     error = np.abs(plan.run().data - Direct().sums(plan.full)).max() / plan.scale_jy

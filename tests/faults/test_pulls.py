@@ -90,7 +90,8 @@ def test_the_error_of_a_score_is_that_of_the_noise(name):
     from astropy import units as u
 
     import instrument
-    from instrument.image.mocks import FINE, leaked, noise_cube, polarized_screens
+    from instrument.image.mocks import leaked, noise_cube, polarized_screens
+    from instrument.sky.screens import FINE
 
     band = np.linspace(134, 166, 81) * u.MHz
     truth = leaked(polarized_screens(pixels=24, pixel=2 * u.arcmin, frequencies=band, screens=FINE, seed=1))

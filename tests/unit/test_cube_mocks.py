@@ -8,7 +8,7 @@ from astropy.coordinates import SkyCoord
 import instrument
 from instrument import InputError, Psf, StokesCube, leaked, leaked_through, noise_cube, polarized_screens
 from instrument.errors import InstrumentWarning
-from instrument.image.mocks import FINE, TEN, Screens
+from instrument.sky.screens import FINE, TEN, Screens
 
 LIGHT = 299792458.0
 BAND = np.linspace(134, 166, 41) * u.MHz

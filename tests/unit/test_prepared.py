@@ -8,8 +8,9 @@ import pytest
 from astropy import units as u
 
 import instrument
-from instrument import InputError, Observation, Predictor, Prepared, Scene, Work, planner
+from instrument import InputError, Observation, Predictor, Prepared, Scene, Work
 from instrument.errors import RefusedError
+from instrument.predict import choice
 from instrument.predict.direct import Direct
 
 ASKED: list[tuple[int, int, int, int]] = []
@@ -54,8 +55,8 @@ class Stateless(Predictor):
 @pytest.fixture
 def engines(monkeypatch):
     def use(**found):
-        monkeypatch.setattr(planner, "available", lambda kind: dict.fromkeys(found, registered))
-        monkeypatch.setattr(planner, "load", lambda kind, name: found[name])
+        monkeypatch.setattr(choice, "available", lambda kind: dict.fromkeys(found, registered))
+        monkeypatch.setattr(choice, "load", lambda kind, name: found[name])
 
     registered = instrument.available("engines")["direct"]
     ASKED.clear()
