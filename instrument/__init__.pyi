@@ -13,6 +13,8 @@ from .analyze.power.cylinders import Spherical as Spherical
 from .analyze.power.signal import Signal21cm as Signal21cm
 from .analyze.power.spectra import Spectrum2D as Spectrum2D
 from .analyze.power.window import EoRWindow as EoRWindow
+from .analyze.sources.catalogue import SourceCatalogue as SourceCatalogue
+from .analyze.sources.finder import SourceFinder as SourceFinder
 from .analyze.sources.leakage import Leakage as Leakage
 from .beam_state import BeamState as BeamState
 from .calibrate.base import Calibrator as Calibrator

@@ -15,6 +15,8 @@ from instrument.analyze.power.signal import Signal21cm
 from instrument.analyze.power.spectra import Spectrum2D, spectrum_2d
 from instrument.analyze.power.transform import Transform, cells_of
 from instrument.analyze.power.window import EoRWindow, eor_window
+from instrument.analyze.sources.catalogue import SourceCatalogue
+from instrument.analyze.sources.finder import SourceFinder
 from instrument.analyze.sources.fluxes import SourceFluxes
 from instrument.analyze.sources.leakage import Leakage, leakage_of
 from instrument.analyze.sources.photometry import ForcedPhotometry
@@ -65,6 +67,16 @@ class Analyzer:
                 )
             fluxes = (photometry or ForcedPhotometry()).measure(self.visibilities, sky)
         return leakage_of(fluxes, centre, channel)
+
+    def sources(self, finder: SourceFinder | None = None, channel: Index | None = None) -> SourceCatalogue:
+        """Sources in the cube, by islands and Gaussian fits in Stokes I, with their fluxes in all channels and Stokes.
+
+        In the weighted mean of all channels, or in one. `ForcedPhotometry().measure(visibilities, found.sky())`
+        measures what was found in the visibilities, together.
+        """
+        if self.cube is None:
+            raise InputError("sources are found in a cube: Analyzer(cube)")
+        return (finder or SourceFinder()).find(self.cube, channel)
 
     def spectrum_2d(
         self,
