@@ -22,6 +22,7 @@ from instrument.sky.made import jy_per_k
 from instrument.units import Direction, Float, one_si, to_si
 
 Unit = Literal["Jy/beam", "Jy/pixel", "K"]
+SolidAngle = Literal["fit", "sum"]
 
 
 @checked
@@ -111,10 +112,29 @@ class StokesCube:
             jansky = jansky * jy_per_k(self.freq_hz, self.pixel_rad**2)[:, None, None, None]
         return ImageSky(grid=self.grid, stokes=jansky, frequencies=self.freq_hz * u.Hz)
 
-    def to_kelvin(self) -> StokesCube:
+    def solid_angle_sr(self, of: SolidAngle = "fit") -> Float:
+        """Solid angle of the PSF of each channel, sr (F,): of the Gaussian fitted to it, or of the sum of its image.
+
+        The sum is that of all sidelobes in the image. It tells what a cube does to diffuse emission only where the
+        array sees that: the sum of a PSF of natural weights without the zero spacing tends to 0 in a large image.
+        """
+        if of not in get_args(SolidAngle):
+            raise InputError(f"of = {of!r} is not one of {', '.join(map(repr, get_args(SolidAngle)))}")
+        psf = self.psf
+        if psf is None or (of == "sum" and psf.data is None):
+            raise InputError(
+                f"the solid angle {of!r} needs {'the image of the PSF' if psf else 'a PSF'}, which this cube has "
+                "not: images of an Imager have both, a FITS file widths alone"
+            )
+        if of == "fit" or psf.data is None:
+            return psf.solid_angle_sr
+        return np.asarray(psf.data.sum(axis=(1, 2)) * self.pixel_rad**2)
+
+    def to_kelvin(self, solid_angle: SolidAngle = "fit") -> StokesCube:
         """The same in K, Rayleigh-Jeans: c² / (2 k nu² Omega), the solid angle of each channel's PSF, or of a pixel.
 
-        Raises `InputError` without a PSF and where a channel that has data has none: a width of 0 or NaN.
+        `solid_angle` is that of the Gaussian "fit", or of the "sum" of the image of the PSF; see `solid_angle_sr`.
+        Raises `InputError` without a PSF and where a channel that has data has none: a width of 0 or NaN, a sum of 0.
         """
         if self.unit == "K":
             return self
@@ -122,7 +142,7 @@ class StokesCube:
             raise InputError(
                 "a cube in Jy/beam needs its PSF to become K: give psf=Psf.gaussian(major, minor, angle), its widths"
             )
-        omega = self.psf.solid_angle_sr if self.psf and self.unit == "Jy/beam" else self.pixel_rad**2
+        omega = self.solid_angle_sr(solid_angle) if self.unit == "Jy/beam" else self.pixel_rad**2
         omega = np.broadcast_to(omega, len(self.data))
         usable = np.isfinite(omega) & (omega > 0)
         wrong = np.array([not ok and not np.isnan(x).all() for ok, x in zip(usable, self.data, strict=True)])

@@ -7,9 +7,10 @@ from astropy.coordinates import SkyCoord
 from astropy.wcs import WCS
 
 import instrument
-from instrument import Imager, InputError, Observation, PointSky, Scene, StokesCube
+from instrument import Imager, InputError, Observation, PointSky, Psf, Scene, StokesCube
 from instrument.image.psf import fit_psf
 from instrument.observe.directions import LIGHT
+from instrument.pipeline.stages.noise import Noise
 
 CENTRE = SkyCoord("08h13m36.0s +48d13m03s")
 STATIONS = ["CS001HBA0", "CS003HBA1", "CS011HBA0", "CS101HBA0", "CS302HBA1", "RS106HBA", "RS205HBA", "RS208HBA"]
@@ -191,3 +192,25 @@ def test_cube_from_anywhere_is_checked_and_written_with_its_axes(tmp_path):
         StokesCube(data=data, frequencies=[120, 121] * u.MHz, pixel=0.5 * u.arcmin, unit="K")
     with pytest.raises(InputError, match="its PSF"):
         StokesCube(data=data, frequencies=[1, 2, 3] * u.MHz, pixel=1 * u.arcmin).to_kelvin()
+
+
+def test_noise_of_75_nights_is_60_mk_and_its_variance_is_that_of_one_over_75():
+    """SEFD 2820 Jy, 0.19 MHz, 8 h a night, 30-800 wavelengths, 4.3': SEFD / sqrt(4 dnu t N_baselines) = 73 uJy."""
+    array = instrument.load("telescopes", "lofar-hba", beam=None)
+    night = Observation(
+        phase_centre=CENTRE, transit="2012-12-07", duration=8 * u.hour, interval=15 * u.min,
+        frequencies=[150] * u.MHz, channel_width=0.19 * u.MHz,
+    )  # fmt: skip
+    nothing = Scene(instrument=array, sky=PointSky.at(CENTRE, [1e-12]), observation=night).plan().run()
+    of_one, of_all = (
+        Noise(sefd=2820 * u.Jy, nights=nights, seed=5).start(None).take(nothing).data - nothing.data
+        for nights in (1, 75)
+    )
+    assert np.allclose(of_one, np.sqrt(75) * of_all, rtol=1e-9, atol=1e-11)
+    cube = Imager(pixels=256, pixel=1 * u.arcmin, uv_range=(30, 800)).image(nothing.with_data(of_all))
+    rms = cube.data[0].std(axis=(1, 2))
+    length = np.hypot(*np.moveaxis(nothing.uvw_m[..., :2], -1, 0)) * 150e6 / LIGHT
+    used = ((length >= 30) & (length <= 800)).sum() / 32
+    assert rms.mean() == pytest.approx(2820 / np.sqrt(4 * 0.19e6 * 600 * 3600 * used), rel=0.02)
+    kelvin = cube.with_psf(Psf.gaussian(4.3 * u.arcmin)).to_kelvin().data[0].std(axis=(1, 2))
+    assert kelvin.mean() == pytest.approx(0.060, rel=0.03)

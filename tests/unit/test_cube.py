@@ -1,5 +1,7 @@
 """StokesCube and Psf: what is refused, kelvin, channels, and FITS there and back."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from astropy import units as u
@@ -53,6 +55,25 @@ def test_kelvin_per_jansky_are_the_numbers_of_a_handbook():
     pixels = cube_of(unit="Jy/pixel").to_kelvin()
     assert pixels.unit == kelvin.unit == "K"
     assert (pixels.data / cube_of().data)[0, 0, 0, 0] == pytest.approx(68384, rel=1e-4)
+
+
+def test_kelvin_by_the_sum_of_the_psf_are_those_of_the_fit_for_a_gaussian_and_nothing_without_a_zero_spacing():
+    y, x = (np.arange(64) - 32) * np.ones((2, 1))
+    lobe = np.exp(-4 * np.log(2) * ((y[:, None] / 8) ** 2 + (x / 6) ** 2))
+    given = Psf.gaussian(8 * u.arcmin, 6 * u.arcmin)
+    cube = StokesCube(np.ones((1, 4, 64, 64)), [150] * u.MHz, 1 * u.arcmin, "Jy/beam", constants="data")
+    whole = cube.with_psf(replace(given, data=lobe[None]))
+    fit, total = whole.solid_angle_sr(), whole.solid_angle_sr("sum")
+    assert fit == pytest.approx(total, rel=1e-9)
+    assert whole.to_kelvin("sum").data == pytest.approx(whole.to_kelvin().data, rel=1e-9)
+    with pytest.raises(InputError, match="needs the image of the PSF"):
+        cube.with_psf(given).to_kelvin("sum")
+    none = cube.with_psf(replace(given, data=(lobe - lobe.mean())[None]))
+    assert abs(none.solid_angle_sr("sum")[0]) < 1e-12 * fit[0]
+    with pytest.raises(InputError, match=r"channel 0 is -.* sr: it has no K"):
+        cube.with_psf(replace(given, data=(lobe - 1.01 * lobe.mean())[None])).to_kelvin("sum")
+    with pytest.raises(InputError, match="'mean' is not one of 'fit', 'sum'"):
+        whole.to_kelvin("mean")
 
 
 def test_kelvin_keeps_float32_and_takes_whole_numbers():

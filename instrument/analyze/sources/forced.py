@@ -32,8 +32,9 @@ def areas(p: Float, beam: Float) -> Float:
 def forced(cube: StokesCube, p: Float, wide: Bool, label: Int, labels: Int, half: int) -> tuple[Float, Float]:
     """Flux densities and their errors, Jy (F, n, 4), of Gaussians in pixels (n, 6).
 
-    Points have the beam of the channel. Those of one `label` (n,) are measured together, in windows of `half` pixels about them, where `labels` (Ny, Nx) is
-    theirs or 0. Places and shapes are held. NaN where a channel or Stokes parameter has no data or beam.
+    Points have the beam of the channel. Those of one `label` (n,) are measured together, in windows of `half` pixels
+    about them, where `labels` (Ny, Nx) is theirs or 0. Places and shapes are held. NaN where a channel or Stokes
+    parameter has no data or beam.
     """
     flux, error = np.full((2, len(cube.data), len(p), 4), np.nan)
     groups = [np.flatnonzero(label == one) for one in np.unique(label)]

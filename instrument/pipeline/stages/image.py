@@ -12,7 +12,7 @@ import numpy as np
 from instrument.component import KIND, Component
 from instrument.errors import InputError, did_you_mean, unused
 from instrument.image.base import AnyImager, ImageSums
-from instrument.image.cube import StokesCube
+from instrument.image.cube import SolidAngle, StokesCube
 from instrument.image.dirty import ALL_HELD, HELD, WAITING, Imager
 from instrument.memory import afford
 from instrument.numbers import brief
@@ -153,12 +153,14 @@ class ImageResult(StageResult):
     def record(self) -> dict[str, Any]:
         """Unit, PSF and rms of the first channel."""
         psf, error = self.cube.psf, self.imager.error()
+        angles: list[SolidAngle] = [] if psf is None else ["fit"] if psf.data is None else ["fit", "sum"]
         widths = () if psf is None else (psf.major_rad, psf.minor_rad)
         return {
             "stage_errors": {"image": f"{error} asked for"} if error else {},
             "image": {
                 "unit": self.cube.unit,
                 "psf_arcmin": [round(float(np.rad2deg(x[0]) * 60), 3) for x in widths],
+                "solid_angle_sr": {of: float(self.cube.solid_angle_sr(of)[0]) for of in angles},
                 "rms": {s: float(np.nanstd(self.cube.data[0, k])) for k, s in enumerate("IQUV")},
                 **self.said,
             },

@@ -5,20 +5,25 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Self
 
+import numpy as np
 from pydantic import Field
 
 from instrument.errors import InputError
 from instrument.pipeline.stage import Beside, EachBlock, Running, Stage, StageRun
 from instrument.pipeline.work import StageWork, copies
-from instrument.units import Jansky, Seed
+from instrument.units import Jansky, Real, Seed
 
 STEP = 3  # of the seeds of a scene
 
 
 class Noise(Stage):
-    """Thermal noise of stations whose system equivalent flux density is `sefd`, independent in every visibility."""
+    """Thermal noise of stations whose system equivalent flux density is `sefd`, independent in every visibility.
+
+    With `nights` it is that of the mean of so many nights like this one: its variance over their number.
+    """
 
     sefd: Annotated[Jansky, Field(gt=0)]
+    nights: Annotated[float, Real(above=0)] = 1.0
     seed: Seed
 
     @classmethod
@@ -34,10 +39,12 @@ class Noise(Stage):
 
     def work(self, run: Running) -> StageWork:
         """Eight random numbers a visibility, and another block."""
-        return copies(run.visibilities, run.block, 3.0, 0.3e-6, f"{self.sefd:g} Jy a station")
+        nights = f", mean of {self.nights:g} nights" if self.nights != 1 else ""
+        return copies(run.visibilities, run.block, 3.0, 0.3e-6, f"{self.sefd:g} Jy a station{nights}")
 
     def start(self, run: Running) -> StageRun:
         """The stage at work."""
         from astropy import units as u
 
-        return EachBlock(lambda block: block.with_noise(self.sefd * u.Jy, seed=self.seed))
+        sefd = self.sefd / np.sqrt(self.nights) * u.Jy
+        return EachBlock(lambda block: block.with_noise(sefd, seed=self.seed))
