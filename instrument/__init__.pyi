@@ -10,6 +10,8 @@ from .analyze.faraday.band import k_par_of_depth as k_par_of_depth
 from .analyze.faraday.cube import FaradayCube as FaradayCube
 from .analyze.power.cylinders import Cylindrical as Cylindrical
 from .analyze.power.cylinders import Spherical as Spherical
+from .analyze.power.recovered import Recovered as Recovered
+from .analyze.power.recovered import recovered_power as recovered_power
 from .analyze.power.signal import Signal21cm as Signal21cm
 from .analyze.power.spectra import Spectrum2D as Spectrum2D
 from .analyze.power.window import EoRWindow as EoRWindow

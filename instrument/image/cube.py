@@ -102,11 +102,21 @@ class StokesCube:
         return out
 
     def sky(self) -> ImageSky:
-        """The cube as a sky for scenes: every pixel a point of its Jy; from Jy/pixel, or K by its solid angle."""
+        """The cube as a sky for scenes: every pixel a point of its Jy; from Jy/pixel, or K by its solid angle.
+
+        From Jy/beam where the beam is known: the sky is then the image as it is blurred, which the plan says.
+        """
         from astropy import units as u
 
         if self.unit == "Jy/beam":
-            raise InputError("a cube in Jy/beam is no sky: its pixels are blurred; give one in Jy/pixel or K")
+            if self.psf is None:
+                raise InputError(
+                    "a cube in Jy/beam is no sky: its pixels are blurred, and by what beam is not known; give one in "
+                    "Jy/pixel or K, or its psf=Psf.gaussian(major, minor, angle)"
+                )
+            widths = np.rad2deg([np.nanmin(self.psf.minor_rad), np.nanmax(self.psf.major_rad)]) * 60
+            text = f"its pixels are blurred already, by a beam of {widths[0]:.3g}' to {widths[1]:.3g}'"
+            return self.to_kelvin().sky().with_fields(remarks=(("image", text),))
         jansky = np.asarray(self.data, float)
         if self.unit == "K":
             jansky = jansky * jy_per_k(self.freq_hz, self.pixel_rad**2)[:, None, None, None]

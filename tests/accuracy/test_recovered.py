@@ -1,0 +1,175 @@
+"""A 21-cm signal and foregrounds in one scene, and what of the power injected is there at the end of the way."""
+
+import warnings
+
+import numpy as np
+import pytest
+from astropy import units as u
+
+import instrument
+from instrument import (
+    GainTerm,
+    Imager,
+    InputError,
+    InstrumentError,
+    Observation,
+    Scene,
+    SelfCal,
+    Signal21cm,
+    StokesCube,
+    SumSky,
+    recovered_power,
+)
+from instrument.analyze.power.signal_sky import SignalSky
+from instrument.sky.synchrotron import Synchrotron
+from instrument.units import Direction
+
+pytestmark = pytest.mark.filterwarnings("ignore::instrument.errors.InstrumentWarning")
+AT = Direction(2.15, 0.84)
+MHZ = np.linspace(140, 146, 16)
+
+
+def white(seed, rms=1.0, shape=(16, 24, 24)):
+    data = np.zeros((shape[0], 4, *shape[1:]))
+    data[:, 0] = rms * np.random.default_rng(seed).normal(size=shape)
+    return StokesCube(data, np.linspace(140, 143, shape[0]) * u.MHz, 4 * u.arcmin, "K")
+
+
+# The ratio -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", ["spherical", "cylindrical"])
+def test_what_came_through_whole_has_ratio_and_transfer_of_one_and_half_of_it_a_quarter(shape):
+    signal = white(1)
+    whole = recovered_power(signal, signal, shape=shape, bins=5)
+    there = np.isfinite(whole.ratio)
+    assert there.sum() >= 4
+    np.testing.assert_allclose(whole.ratio[there], 1, rtol=1e-12)
+    np.testing.assert_allclose(whole.transfer[there], 1, rtol=1e-12)
+    assert np.nanmax(whole.ratio_sigma) < 1e-6
+    half = recovered_power(signal.with_data(0.5 * signal.data), signal, shape=shape, bins=5)
+    np.testing.assert_allclose(half.ratio[there], 0.25, rtol=1e-12)
+    np.testing.assert_allclose(half.transfer[there], 0.5, rtol=1e-12)
+    upside = recovered_power(signal.with_data(-signal.data), signal, shape=shape, bins=5)
+    np.testing.assert_allclose(upside.transfer[there], -1, rtol=1e-12)  # the right power, and none of the signal
+
+
+def test_the_scatter_that_is_said_is_that_over_many_foregrounds_and_noises():
+    """0.8 of a signal under something of three times its power, 60 draws of both that and noise."""
+    signal = white(1)
+    ratios, transfers, said, unit = [], [], [], []
+    for seed in range(60):
+        noise, same = white(500 + seed, 0.6).data, white(900 + seed, 0.6)
+        total = signal.with_data(0.8 * signal.data + white(100 + seed, np.sqrt(3)).data + noise)
+        found = recovered_power(total, signal, noise=same, bins=4)
+        ratios.append(found.ratio), transfers.append(found.transfer)
+        said.append((found.ratio_sigma, found.transfer_sigma))
+        unit.append(found.noise.power / 0.36 / found.injected.power)  # of rms 1, over the power of this one signal
+    sigma = np.sqrt(np.mean(np.square(said), axis=0))
+    for values, due, expected in zip((ratios, transfers), (0.64 + 3 * np.mean(unit, axis=0), 0.8), sigma, strict=True):
+        pull = (np.mean(values, axis=0) - due) / (expected / np.sqrt(60))
+        assert np.abs(pull).max() < 4
+        assert np.std(values, axis=0, ddof=1) / expected == pytest.approx(np.ones(4), abs=0.35)
+
+
+def test_tables_are_written_and_cubes_that_do_not_fit_are_refused(tmp_path):
+    signal = white(1)
+    found = recovered_power(signal, signal, bins=4)
+    found.write(tmp_path / "recovered.ecsv")
+    table = found.table()
+    assert {"k", "injected", "ratio", "ratio_sigma", "transfer", "transfer_sigma", "foreign"} <= set(table.colnames)
+    assert (tmp_path / "recovered.ecsv").read_text().count("\n") > len(table)
+    jansky = StokesCube(signal.data, signal.freq_hz * u.Hz, 4 * u.arcmin, "Jy/pixel")
+    for other, said in (
+        (jansky, "cubes are in K and Jy/pixel"),
+        (white(1, shape=(16, 20, 24)), "pixels|shape"),
+        (signal.with_data(0 * signal.data), "nothing was injected in Stokes I"),
+    ):
+        with pytest.raises(InputError, match=said):
+            recovered_power(signal, other)
+    holes = np.array(signal.data)
+    holes[:, :, 3:6, 3:6] = np.nan
+    np.testing.assert_allclose(recovered_power(signal.with_data(holes), signal, bins=4).ratio, 1, rtol=1e-12)
+
+
+# The skies -------------------------------------------------------------------------------------------------------
+
+BAND = {"band": (140 * u.MHz, 146 * u.MHz), "channels": 16}
+SMALL = {"pixels": 24, "pixel": 20 * u.arcmin}
+
+
+def test_the_signal_as_a_sky_is_the_cube_of_its_table_and_has_no_other_channels():
+    sky = SignalSky(**SMALL, **BAND, seed=5).about(AT)
+    cube = Signal21cm.table().cube(24, 20 * u.arcmin, MHZ * u.MHz, seed=5)
+    np.testing.assert_allclose(sky.planes(MHZ[3:5] * 1e6), cube.sky().stokes[3:5], rtol=1e-6)
+    with pytest.raises(InputError, match=r"no channel at 141 MHz .16 from 140 to 146 MHz.: observe some of these"):
+        sky.planes(np.array([141e6]))
+    for wrong, said in (({"model": "none"}, "no 21-cm model"), ({"band": (2 * u.MHz, 1 * u.MHz)}, "the first channel")):
+        with pytest.raises(InstrumentError, match=said):
+            SignalSky(**{**SMALL, **wrong})
+
+
+def test_total_intensity_has_its_rms_its_slope_and_a_power_law_in_every_pixel():
+    sky = Synchrotron(pixels=128, pixel=4 * u.arcmin, rms=3 * u.K, seed=2)
+    t = np.stack([sky.kelvin(f)[0] for f in (120e6, 150e6, 187.5e6)]).astype(float)
+    assert t[1].std() == pytest.approx(3, rel=1e-5) and abs(t[1].mean()) < 1e-3
+    index = np.log(t[2] / t[0]) / np.log(187.5 / 120)
+    assert index.mean() == pytest.approx(-2.55, abs=1e-3) and index.std() == pytest.approx(0.1, rel=1e-2)
+    np.testing.assert_allclose(t[1] ** 2, t[0] * t[2], rtol=1e-4)
+    uv = np.hypot(*np.meshgrid(*[np.fft.fftfreq(128, sky.pixel)] * 2))
+    power, edges = np.abs(np.fft.fft2(t[1])) ** 2, np.geomspace(20, 300, 7)
+    rings = np.digitize(uv, edges)
+    rings = [(uv[rings == k].mean(), power[rings == k].mean()) for k in range(1, 7)]
+    assert np.polyfit(*np.log(rings).T, 1)[0] == pytest.approx(-2.2, abs=0.25)
+    with pytest.raises(InputError, match="no cell within uv_range"):
+        Synchrotron(pixels=8, pixel=1 * u.arcmin, uv_range=(10, 200))
+
+
+# The whole way ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+def test_a_signal_is_recovered_after_beam_calibration_and_removal():
+    """Stars, Galaxy, synchrotron and a strong signal through LOFAR's beams and gains of 1 %; 10 stations, 16 channels.
+
+    Without foregrounds and errors all of it comes back; what is left under the foregrounds is foreign until they are
+    removed; the signal that a remover takes with them is in the transfer, where foreign power cannot hide it.
+    """
+    names = [f"CS{n:03d}HBA{e}" for n in (1, 2, 3, 4, 5) for e in (0, 1)]
+    lofar = instrument.load("telescopes", "lofar-hba", stations=names, gain=GainTerm(rms=1e-2, seed=3))
+    night = Observation(
+        phase_centre=AT, transit="2012-12-07", duration=8 * u.hour, interval=2 * u.hour, frequencies=MHZ * u.MHz
+    )
+    skies = {
+        "signal": SignalSky(**SMALL, **BAND),
+        "stars": instrument.load("skies", "grid", shape=(3, 3), spacing=1.5 * u.deg, flux=20 * u.Jy),
+        "galaxy": instrument.load("skies", "galaxy", **SMALL, screens={"uv_range": (10, 800)}),
+        "synchrotron": Synchrotron(**SMALL, rms=1 * u.K, uv_range=(7, 85)),
+    }
+    imager = Imager(pixels=32, pixel=20 * u.arcmin, uv_range=(10, 80), weighting="natural")
+
+    def visibilities(array, *members):
+        return Scene(instrument=array, sky=SumSky(skies={k: skies[k] for k in members}), observation=night).plan().run()
+
+    alone = visibilities(lofar.perfect(), "signal")
+    loud = alone.with_data(1e3 * alone.data)  # mK against K: 10 stations have too few cells for the real one
+    rest = visibilities(lofar.perfect(), "stars", "galaxy", "synchrotron")
+    gains = lofar.with_fields(beam=None).chain()
+    total = rest.with_data(rest.data + loud.data).corrupted(gains)
+    solution = SelfCal(tolerance=1e-8).solve(total, rest)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        injected, dirty = (imager.image(v) for v in (loud, total.corrected(solution.term)))
+    clean = recovered_power(injected, injected, bins=4)
+    np.testing.assert_allclose(clean.ratio, 1, rtol=1e-9)
+    before = recovered_power(dirty, injected, bins=4)
+    assert np.all(before.ratio[:3] > 300) and np.all(np.abs(before.transfer - 1) < 5 * before.transfer_sigma)
+    for name, settings in (("pca", {"components": 3}), ("polynomial", {"terms": 3})):
+        remover = instrument.load("foregrounds", name, **settings)
+        after = recovered_power(remover.split(dirty).residual, injected, bins=4)
+        assert np.all(after.ratio[:3] < before.ratio[:3] / 300) and after.ratio[3] < before.ratio[3]
+        assert 0.5 < after.transfer[3] < 1 and after.transfer[1] < 0.2  # slow variation goes with the foreground
+    # a linear remover takes of the signal what it takes of the signal alone
+    due = recovered_power(remover.split(injected).residual, injected, bins=4)
+    assert np.all(np.abs(after.transfer - due.transfer) < 4 * after.transfer_sigma)
+    np.testing.assert_allclose(due.ratio, due.transfer**2 + due.foreign, rtol=1e-9)
