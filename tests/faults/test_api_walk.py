@@ -80,6 +80,7 @@ class World:
         self.window = self.analyzer.eor_window(self.signal)
         self.remover = ins.load("foregrounds", "polynomial", terms=2)
         self.loss = ins.signal_loss(self.remover, self.cube, self.cube, bins=4)
+        self.recovered = ins.recovered_power(self.cube, self.cube, bins=4)
         self.spheres, self.plane = self.analyzer.spherical(), self.analyzer.spectrum_2d()
         self.split = self.remover.split(self.cube)
         self.solution = ins.SelfCal().solve(self.vis, self.vis)
@@ -183,6 +184,9 @@ def calls():
         ("write_h5parm", ins.write_h5parm, {"path": "out.h5", "solution": w.solution, "pattern": "full", "at": None}),
         ("read_frequencies", ins.read_frequencies, {"path": "none.txt"}),
         ("read_psf", ins.read_psf, {"path": "none.fits", "cube": w.cube}),
+        ("recovered_power", ins.recovered_power, {
+            "recovered": w.cube, "injected": w.cube, "noise": w.cube, "bins": 4, "bins_par": 3}),
+        ("Recovered.write", w.recovered.write, {"path": "recovered.ecsv"}),
         ("SignalLoss.within", w.loss.within, {"k_par": (0.0, 1.0), "k_perp": (0.0, 9.0)}),
         ("Separation.nothing", ins.Separation.nothing, {
             "maps": np.zeros((2, 3)), "outcome": ins.Outcome.REFUSED, "remark": "none"}),
