@@ -149,6 +149,7 @@ def within(problem: Problem, uv_range: tuple[float, float] | None, left_out: lis
         uv = at.block(slice(t, t + 64), slice(None)).uvw_m[..., :2]
         length = np.linalg.norm(uv[:, problem.antenna1] - uv[:, problem.antenna2], axis=-1)
         use |= np.any((length >= low) & (length <= high), axis=0)
+    problem = replace(problem, uv_range=uv_range)
     if use.all():
         return problem
     if not use.any():

@@ -134,9 +134,12 @@ class Plan(VisibilitySet):
                 f"{si_prefix(whole + self.memory, 'B')} of visibilities and blocks exceed the limit of "
                 f"{si_prefix(self.limit, 'B')}: take blocks one by one with plan.blocks(), or fewer times or channels"
             )
-        data = np.empty((times, channels, baselines, 2, 2), complex)
+        data, flag = np.empty((times, channels, baselines, 2, 2), complex), np.zeros((1, 1, 1), bool)
         for (t, f), block in zip(self.slices, self.blocks(executor, progress), strict=True):
             data[t, f] = block.data
+            if block.flag.any():
+                flag = np.zeros(data.shape[:3], bool) if flag.size == 1 else flag
+                flag[t, f] = block.flag
         return Visibilities(
             data=data,
             at=self.problem.at.at_centre(),
@@ -144,6 +147,7 @@ class Plan(VisibilitySet):
             antenna2=self.problem.antenna2,
             interval_s=self.problem.interval_s,
             width_hz=self.problem.width_hz,
+            flag=flag,
             beam_state=self._state,
         )
 

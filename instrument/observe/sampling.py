@@ -10,7 +10,7 @@ import numpy as np
 
 from instrument.checked import checked
 from instrument.errors import InputError
-from instrument.observe.directions import EarthFrame, earth_frame, lmn, tangents
+from instrument.observe.directions import EARTH_RATE, EarthFrame, earth_frame, lmn, tangents
 from instrument.observe.layout import Layout
 from instrument.shown import short_repr
 from instrument.units import Direction, Float, Int, instants, plain, unit_vectors
@@ -90,6 +90,30 @@ class Sampling:
     def some(self, which: Int) -> Sampling:
         """The same for some times, by their indices."""
         return self._with_times(which)
+
+    def every(self, interval_s: float, which: Int) -> Sampling:
+        """The same at times counted from the first, every `interval_s`, before and after its own too.
+
+        The first is taken from the Earth as it stands: `slots_s` is rounded to a microsecond.
+        """
+        from astropy import units as u
+
+        if len(which) and which.min() >= 0 and which.max() < len(self.earth):
+            return self.some(which)
+        start = times_of(self.slots_s[:1])
+        there = self.earth.matrices[0] @ earth_frame(start, self.layout.centre_m).matrices[0].T
+        late = float(np.arctan2(there[0, 1], there[0, 0])) / EARTH_RATE
+        times = start + (which * interval_s + late) * u.s
+        earth, slots = earth_frame(times, self.layout.centre_m), self.slots_s[0] + which * interval_s
+        return replace(self, earth=earth, slots_s=slots, seen=None, seen_east=None, seen_centre=None)
+
+    def regular(self, interval_s: float) -> bool:
+        """Whether its times follow each other every `interval_s`, to 10 ns, and are seen from where they are."""
+        if self.seen_centre is not None or not np.allclose(np.diff(self.slots_s), interval_s, rtol=0, atol=1e-5):
+            return False
+        which = np.unique(np.linspace(0, len(self.earth) - 1, 64).round().astype(int))
+        made = self.every(interval_s, np.append(-1, which)).earth.matrices[1:]
+        return bool(np.abs(made - self.earth.matrices[which]).max() < 1e-8 * EARTH_RATE)
 
     def _with_times(self, times: Any) -> Sampling:
         return replace(

@@ -52,6 +52,7 @@ class Problem:
     antenna2: Int
     interval_s: float
     width_hz: float | None = None
+    uv_range: tuple[float, float] | None = None  # wavelengths: what lies outside is not asked for
 
     def block(self, times: slice, channels: slice) -> Problem:
         """The same for some times and channels."""

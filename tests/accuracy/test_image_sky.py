@@ -49,7 +49,7 @@ def test_an_image_is_seen_as_the_list_of_its_pixels():
     sky = sky.with_fields(stokes=sky.stokes[:1], frequencies=None)
     plan = Scene(instrument=lofar(**ERRORS), sky=sky, observation=NIGHT).plan()
     assert plan.engine_name == "direct"
-    assert [i.name for i in plan.refused] == ["matrix"]
+    assert [i.name for i in plan.refused] == ["gridded", "matrix"]
     ra, dec = plan.problem.sky.directions()
     listed = PointSky.at(SkyCoord(ra * u.rad, dec * u.rad), sky.stokes[0].reshape(4, -1).T)
     points = Scene(instrument=lofar(**ERRORS), sky=listed, observation=NIGHT).plan(engine="matrix")

@@ -1,0 +1,309 @@
+"""Gridded: images through beams that differ in time, channel and station, by node images on few samples in time.
+
+V_ab(t) = sum_k J_a(p_k, t) F[c_k B](u_ab(t)) J_b(p_k, t)^H: beams at nodes p_k and functions c_k between them
+(`beam_nodes.py`), a w-gridder for each node and Stokes parameter (`gridding.py`), on as few instants of each baseline
+as it needs (`time_samples.py`). The slow twin is `direct.py`; tests/accuracy/test_gridded.py compares them.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from instrument import mat2
+from instrument.errors import RefusedError
+from instrument.observe.directions import LIGHT, lmn, offset
+from instrument.predict.base import EVERY, Predictor, Prepared, Problem, Work
+from instrument.predict.beam_nodes import ONE, BeamNodes, beam_nodes
+from instrument.predict.beam_times import EACH, BeamTimes, beam_times
+from instrument.predict.grid_atom import Atom, about
+from instrument.predict.gridding import FINEST, Gridder
+from instrument.predict.operator import ImageOperator
+from instrument.predict.rounding import known_gain
+from instrument.predict.time_samples import LONGEST_S, TimeSamples, taps_for, time_samples
+from instrument.sky.image import ImageSky
+from instrument.units import Complex, Direction, Float, Int, unit_vectors
+from instrument.visibilities import Visibilities
+
+LARGEST_ATOM = 2.6e8  # bytes of the visibilities of one channel that are made at once
+FEW = 48  # integrations up to which all are worked out as they are
+NODES, TIMES, BETWEEN, GRIDDING = 0.5, 0.1, 0.15, 0.2  # shares of a tolerance
+ROOT2 = 2**0.5  # the norm of the brightness of 1 Jy
+
+
+class Gridded(Predictor):
+    """Images of any extent, (T, F, B, 2, 2), to a tolerance above 0; the adjoint is exact to rounding."""
+
+    def refuses(self, problem: Problem) -> str | None:
+        """Refuses skies that are not images."""
+        return None if problem.sky.kind == "image" else "the sky is not an image"
+
+    def prepare(self, problem: Problem, tolerance: float) -> Prepared:
+        """Nodes, instants and gridding for a tolerance, each with its share of it."""
+        if not tolerance > 0:
+            raise RefusedError("it interpolates beams and visibilities: give a tolerance above 0")
+        sky = problem.sky
+        assert isinstance(sky, ImageSky)  # or it would have been refused
+        outer = known_gain(problem.chain.gains(), problem.at)
+        share = tolerance / (ROOT2 * max(outer, 1.0))
+        nodes = beam_nodes(problem, sky.grid, NODES * share)
+        least = FINEST * 2 * nodes.growth * nodes.peak / GRIDDING
+        if share < least:
+            raise RefusedError(
+                f"tolerance = {tolerance:g} is below what its gridding can give here, "
+                f"{least * ROOT2 * max(outer, 1.0):.1e}: give that or more, or engine = 'direct'"
+            )
+        peak = max(nodes.peak, 1e-300)
+        instants = EACH
+        if problem.shape[0] > FEW and problem.at.regular(problem.interval_s):
+            tail = int(taps_for(BETWEEN * share / peak)[0] / 2 * LONGEST_S / problem.interval_s)
+            instants = _instants(problem, sky, nodes, (-tail, problem.shape[0] + tail), TIMES * share)
+        ready = GriddedImages(
+            engine=self,
+            problem=problem,
+            atom=(_atom(problem), 1),
+            nodes=nodes,
+            instants=instants,
+            between=BETWEEN * share / peak if instants.step else 0.0,
+            accuracy=min(1e-2, GRIDDING * share / (2 * nodes.growth * peak)),
+        )
+        error = nodes.error + 2 * nodes.growth * peak**0.5 * ROOT2 * instants.error
+        error += (
+            peak * (taps_for(ready.between)[1] if ready.between else 0.0) + 2 * nodes.growth * peak * ready.accuracy
+        )
+        return replace(ready, bound=ROOT2 * max(outer, 1.0) * error, omission=ready.said())
+
+    def work(self, problem: Problem) -> Work:
+        """That of an exact beam at one node, for what is not prepared."""
+        return GriddedImages(self, problem, nodes=ONE).work()
+
+
+@dataclass(frozen=True)
+class GriddedImages(ImageOperator):
+    """The operator of `Gridded`: beams at K nodes, at some instants, gridding to an accuracy."""
+
+    nodes: BeamNodes = ONE
+    instants: BeamTimes = EACH
+    between: float = 0.0  # the error of interpolation between samples, 0 for every integration
+    accuracy: float = 1e-6
+
+    def forward(self, images: Float, times: slice, channels: slice, pairs: tuple[Int, Int] | None = None) -> Complex:
+        """A x: visibilities in Jy, complex (T, F, B, 2, 2); 0 outside the uv range of the problem."""
+        block = self.block(times, channels)
+        out = np.zeros((*block.shape, 2, 2), complex)
+        for seen, f, atom in self._atoms(times, channels):
+            here = np.zeros((seen.stop - seen.start, block.shape[2], 4), complex)
+            atom.samples.spread(atom.forward(images[f], self.functions), here)
+            out[seen, f] = here.reshape(*here.shape[:2], 2, 2)
+        if (gains := self._gains(block)) is not None:
+            out = mat2.sandwich(gains[:, :, block.antenna1], out, gains[:, :, block.antenna2])
+        return out if pairs is None else self._picked(out, pairs)
+
+    def adjoint(self, data: Complex, times: slice, channels: slice, pairs: tuple[Int, Int] | None = None) -> Float:
+        """A^H y: images, real (F, 4, Ny, Nx), of visibilities (T, F, B, 2, 2) of whole atoms."""
+        block = self.block(times, channels)
+        if pairs is not None:
+            data = self._placed(data, pairs)
+        if (gains := self._gains(block)) is not None:
+            one, other = mat2.herm(gains[:, :, block.antenna1]), mat2.herm(gains[:, :, block.antenna2])
+            data = mat2.sandwich(one, data, other)
+        out = np.zeros((block.shape[1], 4, *self.sky.grid.pixels))
+        for seen, f, atom in self._atoms(times, channels):
+            here = np.ascontiguousarray(data[seen, f]).reshape(-1, block.shape[2], 4)
+            out[f] += atom.adjoint(atom.samples.gather(here), self.functions)
+        return out
+
+    def predict(self, times: slice, channels: slice) -> Visibilities:
+        """The sums of a block with their coordinates; what lies outside the uv range of the problem is flagged."""
+        found = super().predict(times, channels)
+        if self.problem.uv_range is None:
+            return found
+        flag = np.ones(found.data.shape[:3], bool)
+        for seen, f, first, last, channel in self._cuts(times, channels):
+            begin, end = self._windows(first, last, channel)
+            t = np.arange(last - first)[:, None]
+            flag[seen, f] = (t < begin) | (t >= end)
+        return replace(found, flag=flag)
+
+    def work(self, times: slice = EVERY, channels: slice = EVERY) -> Work:
+        """Transforms of every node and Stokes parameter, beams at the instants, and what lies between."""
+        nt, nf, baselines = self.block(times, channels).shape
+        stations, pixels, nodes = self.problem.at.shape[2], len(self.sky.grid), len(self.nodes)
+        kinds = sum(self.sky.nonzero(self.problem.at.freq_hz[channels]))
+        samples = float(self._count * nt / self.problem.shape[0]) * nf
+        atoms = nf * -(-nt // self.atom[0])
+        digits = 1 - np.log10(self.accuracy) / 6  # 9 ms at 1e-3 and 15 ms at 1e-6 for 480 x 480
+        moments = len(self.instants.instants(0, min(nt, self.atom[0])))
+        seconds = nodes * kinds * (4e-8 * digits * pixels * atoms + 1.3e-7 * digits * samples)
+        seconds += 6e-8 * nodes * samples + 8e-7 * atoms * nodes * moments * stations + 1.5e-7 * nt * nf * baselines
+        held = (64 + 16 * kinds + 100) * samples / max(atoms, 1) + 64.0 * stations * nodes * moments
+        held += 64.0 * stations * min(nt, self.atom[0]) * 2 + 200.0 * pixels + 2 * 64.0 * nt * nf * baselines
+        return Work(2e9 * seconds, 8.0 * nodes * pixels, held, seconds)
+
+    def said(self) -> tuple[str, str]:
+        """What is interpolated, for a plan."""
+        of = self.problem.shape[0] * self.problem.shape[2]
+        text = f"beams at {len(self.nodes)} nodes" if len(self.nodes) > 1 else "no beam differs over the image"
+        if self.instants.step:
+            text += f", every {self.instants.step * self.problem.interval_s:.0f} s"
+        if self.between:
+            text += f"; {self._count / of:.0%} of the visibilities, the others between"
+        return "beams of every pixel", f"{text} (leakage alone {ROOT2 * self.nodes.leakage:.1e})"
+
+    @cached_property
+    def functions(self) -> Float:
+        """The functions between nodes on the image, (K, Ny, Nx)."""
+        return self.nodes.on(self.sky.grid)
+
+    @cached_property
+    def _count(self) -> int:
+        """Samples of the first atom of the middle channel, times the number of atoms in time."""
+        nt = min(self.atom[0], self.problem.shape[0])
+        return int(self._samples(0, nt, self.problem.shape[1] // 2).count * self.problem.shape[0] / nt)
+
+    @cached_property
+    def _rates(self) -> Float:
+        """How fast each baseline moves, m/s, times the reach of the image (B,): turns a second for each 1/m."""
+        at, interval = self.problem.at, self.problem.interval_s
+        slots = np.unique(np.linspace(0, at.shape[0] - 1, min(at.shape[0], 97)).round().astype(int))
+        if len(slots) < 2:
+            return np.zeros(self.problem.shape[2])
+        some = at.at_centre().every(interval, np.stack([slots, slots + 1], axis=1).ravel())
+        uvw = some.uvw_m.reshape(len(slots), 2, -1, 3)
+        moved = (uvw[:, 1] - uvw[:, 0]) / interval
+        moved = moved[:, self.problem.antenna1] - moved[:, self.problem.antenna2]
+        rate = np.hypot(moved[..., 0], moved[..., 1]) * self.reach[0] + np.abs(moved[..., 2]) * self.reach[1]
+        return np.asarray(1.02 * rate.max(axis=0))  # between the instants that were looked at
+
+    @cached_property
+    def reach(self) -> tuple[float, float]:
+        """The largest distance of a pixel from the phase centre, sin and 1 - cos."""
+        ny, nx = self.sky.grid.pixels
+        edge = np.concatenate([
+            np.stack([np.repeat(y, nx), np.arange(nx)], axis=1) for y in (0, ny - 1)
+        ] + [np.stack([np.arange(ny), np.repeat(x, ny)], axis=1) for x in (0, nx - 1)])  # fmt: skip
+        seen = np.abs(lmn(unit_vectors(*self.sky.grid.at(*edge.T)), self.problem.at.centre))
+        return float(np.hypot(seen[:, 0], seen[:, 1]).max()), float(seen[:, 2].max())
+
+    def _windows(self, first: int, last: int, channel: int) -> tuple[Int, Int]:
+        """Where each baseline enters the uv range of the problem, and leaves it for good, (B,) each, from `first`."""
+        count, problem = last - first, self.problem
+        if problem.uv_range is None:
+            return np.zeros(problem.shape[2], int), np.full(problem.shape[2], count)
+        uv = problem.at.at_centre().block(slice(first, last), slice(channel, channel + 1)).uvw_m[..., :2]
+        uv = uv * (float(problem.at.freq_hz[channel]) / LIGHT)
+        within = np.empty((count, problem.shape[2]), bool)
+        for t in range(count):  # never (T, B, 2)
+            length = np.linalg.norm(uv[t, problem.antenna1] - uv[t, problem.antenna2], axis=-1)
+            within[t] = (length >= problem.uv_range[0]) & (length <= problem.uv_range[1])
+        there = within.any(axis=0)
+        return np.argmax(within, axis=0) * there, (count - np.argmax(within[::-1], axis=0)) * there
+
+    def _samples(self, first: int, last: int, channel: int) -> TimeSamples:
+        """Samples of some integrations of a channel."""
+        begin, end = self._windows(first, last, channel)
+        interval = self.problem.interval_s
+        if not self.between:
+            return time_samples(np.zeros(len(begin)), begin, end, interval, 0.0)
+        # what polynomials through 8 instants carry turns no faster than that
+        beams = 0.06 / (self.instants.step * interval) if len(self.nodes) > 1 else 0.0
+        turns = self._rates * float(self.problem.at.freq_hz[channel]) / LIGHT + beams
+        return time_samples(turns, begin, end, interval, self.between)
+
+    def _cuts(self, times: slice, channels: slice) -> Iterator[tuple[slice, int, int, int, int]]:
+        """Each atom of some times and channels: its times and channel among them, and in the problem."""
+        start, stop, _ = times.indices(self.problem.shape[0])
+        for first in range(start, stop, self.atom[0]):
+            last = min(first + self.atom[0], stop)
+            for f, channel in enumerate(range(*channels.indices(self.problem.shape[1]))):
+                yield slice(first - start, last - start), f, first, last, channel
+
+    def _atoms(self, times: slice, channels: slice) -> Iterator[tuple[slice, int, Atom]]:
+        """Each atom of some times and channels that has samples: its times and its channel among them."""
+        for seen, f, *where in self._cuts(times, channels):
+            samples = self._samples(*where)
+            if samples.count:
+                yield seen, f, self._atom(samples, *where)
+
+    def _atom(self, samples: TimeSamples, first: int, last: int, channel: int) -> Atom:
+        at, freq, interval = self.problem.at, float(self.problem.at.freq_hz[channel]), self.problem.interval_s
+        here = slice(first, last), slice(channel, channel + 1)
+        rows, slots = samples.listed()
+        begin, end = int(slots.min()), int(slots.max()) + 1
+        stations = at.at_centre().block(*here).every(interval, np.arange(begin, end)).uvw_m * (freq / LIGHT)
+        one, other = self.problem.antenna1[rows], self.problem.antenna2[rows]
+        uvw = stations[slots - begin, one] - stations[slots - begin, other]
+        uvw, shift = about(uvw, self._centre, at.centre)
+        moments = self.instants.instants(begin, end)
+        beams = _towards(self.problem, self.sky, self.nodes).block(*here).every(interval, moments)
+        jones = self.problem.chain.beams().jones(beams)
+        jones = np.broadcast_to(jones, (len(moments), 1, at.shape[2], len(self.nodes), 2, 2))[:, 0]
+        threads = 1 if self.problem.shape[1] > 1 else os.cpu_count() or 1
+        gridder = Gridder(uvw, self.sky.grid.pixels, self.sky.grid.pixel, self.accuracy, threads)
+        listed = one.astype(np.int32), other.astype(np.int32), (slots - begin).astype(np.int32)
+        return Atom(samples, listed, gridder, shift, jones, self.instants, end - begin)
+
+    @property
+    def _centre(self) -> Direction:
+        centre = self.sky.grid.centre
+        assert centre is not None  # placed, or it would have been refused
+        return centre
+
+    def _gains(self, block: Problem) -> Complex | None:
+        """What is left of the beams, (T, F, A, 2, 2), or `None` for nothing."""
+        gains = block.chain.gains()
+        if not gains.terms:
+            return None
+        found = gains.jones(block.at.at_centre())[:, :, :, 0]
+        return np.broadcast_to(found, (*block.at.shape[:3], 2, 2))
+
+    def _rows(self, pairs: tuple[Int, Int]) -> tuple[Int, Any]:
+        """Where pairs of antennas are among the baselines, and which stand the other way round."""
+        known = {
+            p: k for k, p in enumerate(zip(self.problem.antenna1.tolist(), self.problem.antenna2.tolist(), strict=True))
+        }
+        given = list(zip(np.asarray(pairs[0]).tolist(), np.asarray(pairs[1]).tolist(), strict=True))
+        turned = np.array([p not in known for p in given], bool)
+        return np.array([known[p[::-1] if t else p] for p, t in zip(given, turned, strict=True)], int), turned
+
+    def _picked(self, data: Complex, pairs: tuple[Int, Int]) -> Complex:
+        rows, turned = self._rows(pairs)
+        out = data[:, :, rows]
+        out[:, :, turned] = mat2.herm(out[:, :, turned])
+        return out
+
+    def _placed(self, data: Complex, pairs: tuple[Int, Int]) -> Complex:
+        rows, turned = self._rows(pairs)
+        data = np.array(data)
+        data[:, :, turned] = mat2.herm(data[:, :, turned])
+        out = np.zeros((*data.shape[:2], self.problem.shape[2], 2, 2), complex)
+        for k, row in enumerate(rows):  # the same baseline may come twice
+            out[:, :, row] += data[:, :, k]
+        return out
+
+
+def _first(part: slice) -> int:
+    return part.start or 0
+
+
+def _atom(problem: Problem) -> int:
+    """Integrations of one channel that are made together."""
+    times, _, baselines = problem.shape
+    return max(1, min(times, max(FEW, int(LARGEST_ATOM / (64 * baselines)))))
+
+
+def _towards(problem: Problem, sky: ImageSky, nodes: BeamNodes) -> Any:
+    """The sampling of a problem towards the nodes."""
+    assert sky.grid.centre is not None  # placed, or it would have been refused
+    return problem.at.towards(*offset(sky.grid.centre, nodes.lm[:, 0], nodes.lm[:, 1]))
+
+
+def _instants(problem: Problem, sky: ImageSky, nodes: BeamNodes, span: tuple[int, int], share: float) -> BeamTimes:
+    """Instants of beams at the nodes for integrations of a span; every one where that will not do."""
+    wanted = share / (2 * ROOT2 * nodes.growth * max(nodes.peak, 1e-300) ** 0.5)
+    return beam_times(problem.chain.beams(), _towards(problem, sky, nodes), problem.interval_s, span, wanted)
