@@ -26,7 +26,7 @@ from instrument.predict.gridding import FINEST, Gridder
 from instrument.predict.operator import ImageOperator
 from instrument.predict.rounding import known_gain
 from instrument.predict.time_samples import LONGEST_S, TimeSamples, taps_for, time_samples
-from instrument.sky.image import ImageSky
+from instrument.sky.pixels import PixelSky
 from instrument.units import Complex, Direction, Float, Int, unit_vectors
 from instrument.visibilities import Visibilities
 
@@ -48,7 +48,7 @@ class Gridded(Predictor):
         if not tolerance > 0:
             raise RefusedError("it interpolates beams and visibilities: give a tolerance above 0")
         sky = problem.sky
-        assert isinstance(sky, ImageSky)  # or it would have been refused
+        assert isinstance(sky, PixelSky)  # or it would have been refused
         outer = known_gain(problem.chain.gains(), problem.at)
         share = tolerance / (ROOT2 * max(outer, 1.0))
         nodes = beam_nodes(problem, sky.grid, NODES * share)
@@ -297,13 +297,13 @@ def _atom(problem: Problem) -> int:
     return max(1, min(times, max(FEW, int(LARGEST_ATOM / (64 * baselines)))))
 
 
-def _towards(problem: Problem, sky: ImageSky, nodes: BeamNodes) -> Any:
+def _towards(problem: Problem, sky: PixelSky, nodes: BeamNodes) -> Any:
     """The sampling of a problem towards the nodes."""
     assert sky.grid.centre is not None  # placed, or it would have been refused
     return problem.at.towards(*offset(sky.grid.centre, nodes.lm[:, 0], nodes.lm[:, 1]))
 
 
-def _instants(problem: Problem, sky: ImageSky, nodes: BeamNodes, span: tuple[int, int], share: float) -> BeamTimes:
+def _instants(problem: Problem, sky: PixelSky, nodes: BeamNodes, span: tuple[int, int], share: float) -> BeamTimes:
     """Instants of beams at the nodes for integrations of a span; every one where that will not do."""
     wanted = share / (2 * ROOT2 * nodes.growth * max(nodes.peak, 1e-300) ** 0.5)
     return beam_times(problem.chain.beams(), _towards(problem, sky, nodes), problem.interval_s, span, wanted)
