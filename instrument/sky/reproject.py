@@ -46,7 +46,8 @@ def reprojected(sky: ImageSky, grid: ImageGrid) -> ImageSky:
     where = lmn(unit_vectors(ra, dec), sky.grid.centre)
     (ny, nx), step = sky.grid.pixels, sky.grid.pixel
     y, x = ny // 2 + where[:, 1] / step, nx // 2 - where[:, 0] / step
-    seen = (where[:, 2] > -1).reshape(grid.pixels)  # not behind
+    inside = (np.abs(y - (ny - 1) / 2) <= ny / 2) & (np.abs(x - (nx - 1) / 2) <= nx / 2)
+    seen = ((where[:, 2] > -1) & inside).reshape(grid.pixels)  # neither behind nor beyond the rim
     axis = tangents(*(np.array([a]) for a in sky.grid.centre))[1][0]
     before, after = angle_of(axis, *sky.grid.directions()), angle_of(axis, ra, dec)
     areas, new = solid_angles(sky.grid), solid_angles(grid)
@@ -55,8 +56,8 @@ def reprojected(sky: ImageSky, grid: ImageGrid) -> ImageSky:
     for planes, made in zip(sky.stokes, out, strict=True):
         smooth = turned(planes / areas, -before)
         found = [np.stack([_spline(p, (y, x), order) for p in smooth]) for order in (BEST, OTHER)]
-        best, other = (turned(f.reshape(4, *grid.pixels), after) for f in found)
-        made[:] = np.where(seen, best, 0) * new
+        best, other = (np.where(seen, turned(f.reshape(4, *grid.pixels), after), 0) for f in found)
+        made[:] = best * new
         worst = max(worst, float(np.abs(best - other).max() / (np.abs(best).max() or 1.0)))
     return sky.with_fields(grid=grid, stokes=out, remarks=(*sky.remarks, ("reprojection", _said(sky, out, worst))))
 
@@ -74,7 +75,7 @@ def _spline(image: Float, places: tuple[Float, Float], order: int) -> Any:
 
     if not image.any():
         return np.zeros(len(places[0]))
-    return map_coordinates(image, places, order=order, mode="grid-constant")
+    return map_coordinates(image, places, order=order, mode="mirror")  # a rim is no edge: zeros beyond it would ring
 
 
 def _said(sky: ImageSky, out: Float, worst: float) -> str:

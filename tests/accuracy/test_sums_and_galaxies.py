@@ -1,6 +1,7 @@
 """Sums of skies, each member by its own engine; the polarized Galaxy at any channel, its peak and its spectrum."""
 
 import pickle
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -178,6 +179,23 @@ def test_the_galaxy_is_planned_predicted_and_checked():
     same = Scene(instrument=lofar(), sky=fixed, observation=NIGHT).plan()
     assert np.array_equal(same.run().data, vis.data) and same.scale_jy == pytest.approx(plan.scale_jy, rel=1e-12)
     assert {i.name for i in plan.left_out} >= {"I, V of the sky"}
+
+
+def test_what_the_galaxy_takes_while_it_is_summed_was_planned():
+    """96 x 96 pixels, two channels: no images of all channels, and the fields of ten screens are counted."""
+    sky = Galaxy(pixels=96, pixel=2 * u.arcmin, seed=11)
+    plan = Scene(instrument=lofar(), sky=sky, observation=NIGHT).plan()
+    plan.ready.sums(slice(0, 1), slice(0, 1))  # compiled and imported
+    again = Scene(instrument=lofar(), sky=Galaxy(pixels=96, pixel=2 * u.arcmin, seed=12), observation=NIGHT)
+    tracemalloc.start()
+    try:
+        fresh = again.plan()
+        (t, f), *_ = fresh.slices
+        fresh.ready.sums(t, f)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert 0.2 * fresh.work.slot_bytes < peak <= 1.2 * fresh.work.slot_bytes
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from instrument.observe.sampling import Sampling
 from instrument.pipeline.stage import Draw, Running, StageResult, StageRun
 from instrument.plan import Plan
 from instrument.report.page import Block, Card, Details, Figures, Section, Table, Text, number
-from instrument.sky.base import Sky
+from instrument.sky.base import PlacedSky
 from instrument.sky.points import PointSky, points_of
 from instrument.units import Direction, Float
 from instrument.visibilities import Visibilities
@@ -30,12 +30,12 @@ PLANES: tuple[tuple[Literal["linear", "circular"], str], ...] = (
 )
 
 
-def listed(sky: Sky) -> PointSky:
-    """The sources of a placed sky, whose fluxes are measured; raises `InputError` where it is no list of them."""
-    found = points_of(sky)
-    if found is None:
+def listed(sky: PlacedSky) -> PointSky:
+    """The sources of a placed sky, whose fluxes are measured: of a sum those of its lists. Raises `InputError`."""
+    lists = [found for one in sky.members().values() if (found := points_of(one)) is not None]
+    if not lists:
         raise InputError("[analyze] products = ['leakage'] needs a sky that is a list of sources")
-    return found
+    return lists[0] if len(lists) == 1 else PointSky.join(*lists)
 
 
 class LeakageRun(StageRun):
