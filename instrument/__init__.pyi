@@ -84,6 +84,7 @@ from .scene import Scene as Scene
 from .sky.base import PlacedSky as PlacedSky
 from .sky.base import Sky as Sky
 from .sky.image import ImageSky as ImageSky
+from .sky.made import ImageMaker as ImageMaker
 from .sky.pixels import PixelSky as PixelSky
 from .sky.points import PointSky as PointSky
 from .sky.sums import SumSky as SumSky

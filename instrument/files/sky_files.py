@@ -79,7 +79,10 @@ class ImageFile(_FileSky):
 
         freq = None if self.frequencies is None else self.frequencies * u.Hz
         cube = read_cube(*self.file, stokes=self.stokes, unit=self.unit, frequencies=freq)
-        sky = _filled(cube, self.blanks == "zero", harmless(Path(self.file[0]).name)).sky()
+        name = harmless(Path(self.file[0]).name)
+        # float64 beside what was read, and once more while it is checked
+        afford(24.0 * cube.data.size, f"{name}: a sky of {len(cube.data)} channels", "cut out channels or a part")
+        sky = _filled(cube, self.blanks == "zero", name).sky()
         if self.temperature_index is not None:
             # Jy of a kelvin go as nu²
             sky = sky.with_fields(spectral_index=self.temperature_index + 2)
@@ -95,10 +98,13 @@ class ImageFile(_FileSky):
 
 def _filled(cube: StokesCube, zero: bool, file: str) -> StokesCube:
     """A cube without NaN: a Stokes parameter without any data is 0, other pixels without data too if they may."""
+    blank = np.isnan(cube.data)
+    if not blank.any():
+        return cube
     data = np.array(cube.data)
-    empty = np.isnan(data).all(axis=(0, 2, 3))
+    empty = blank.all(axis=(0, 2, 3))
     data[:, empty] = 0
-    blank = np.isnan(data)
+    blank[:, empty] = False
     if blank.any() and not zero:
         f, s, y, x = np.argwhere(blank)[0].tolist()
         where = f"pixel ({y}, {x}) of {NAMES[s]} in channel {f}"

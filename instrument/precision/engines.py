@@ -29,8 +29,9 @@ def contests_of_scene(name: str, engines: dict[str, Any], form: Form) -> list[Co
 
     scene = _few_times(parse(read_tables(name)).scene())
     full = scene.plan().full
-    if full.sky.kind == "image":
-        raise InputError(f"scene {name}: its sky is an image, and the truth of engines is of lists of sources so far")
+    if full.sky.kind != "points":
+        what = "an image" if full.sky.kind == "image" else "no list of sources"
+        raise InputError(f"scene {name}: its sky is {what}, and the truth of engines is of lists of sources so far")
     chosen = np.flatnonzero((full.antenna1 < STATIONS) & (full.antenna2 < STATIONS))
     truth = visibilities(full.between(full.antenna1[chosen], full.antenna2[chosen]))
     scale = float(np.max(scene.plan().scale_jy))

@@ -73,7 +73,12 @@ class PixelSky(PlacedSky):
     def in_cells(self, images: Any) -> Float:
         """|I| + P of images (4, Ny, Nx), summed in every cell of the outline (N,)."""
         y, x = (edges[:-1] for edges in self._edges)
-        found = power(np.moveaxis(images, 0, -1))
+        # plane by plane, those that are there: `power` of a view along the last axis takes five times as long
+        found = np.hypot(images[1], images[2])
+        if images[3].any():
+            found = np.hypot(found, images[3])
+        if images[0].any():
+            found = found + np.abs(images[0])
         return np.asarray(np.add.reduceat(np.add.reduceat(found, y, axis=0), x, axis=1).ravel())
 
     @cached_property

@@ -29,6 +29,8 @@ NOT_WALKED = {"Component", "InputError", "InstrumentError", "InstrumentWarning",
 NOT_WALKED |= {
     "Direction",
     "ScalarTerm",
+    "ImageMaker",
+    "PixelSky",
     "Predictor",
     "Stage",
     "StageRun",
