@@ -1,4 +1,7 @@
-"""800 sources in 2048 x 2048 pixels: what is found, beside bdsf. Run: python docs/reports/source_finding.py [--bdsf]"""
+"""800 sources in 2048 x 2048 pixels: what is found, beside others.
+
+Run: python docs/reports/source_finding.py --bdsf --photutils
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import sys
 import tempfile
 import time
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -91,6 +95,35 @@ def by_bdsf(path):
     return np.array([[g.centre_sky[0], g.centre_sky[1], g.total_flux] for g in image.gaussians]), seconds
 
 
+def by_photutils(cube):
+    """Places and fluxes of photutils' finder and its fits of the beam, and the seconds it took."""
+    from photutils.detection import DAOStarFinder
+    from photutils.psf import GaussianPSF, PSFPhotometry, SourceGrouper
+
+    begin = time.perf_counter()
+    image = cube.data[0, 0]
+    major, minor = (float(width / PIXEL) for width in BEAM[:2])
+    finder = DAOStarFinder(threshold=5 * SIGMA, fwhm=minor, ratio=minor / major, theta=np.rad2deg(BEAM[2]) + 90)
+    model = GaussianPSF(x_fwhm=minor, y_fwhm=major, theta=BEAM[2] * u.rad)
+    fit = PSFPhotometry(model, (7, 7), finder=finder, grouper=SourceGrouper(major), aperture_radius=major / 2)
+    found = fit(image, error=np.full(image.shape, SIGMA))
+    area = np.pi / (4 * np.log(2)) * major * minor
+    ra, dec = cube.grid.at(np.asarray(found["y_fit"]), np.asarray(found["x_fit"]))
+    rows = np.rad2deg(np.stack([ra, dec], axis=1))
+    return np.column_stack([rows, np.asarray(found["flux_fit"]) / area]), time.perf_counter() - begin
+
+
+def as_ours(found, rows):
+    """A catalogue like ours of places in deg and fluxes (n, 3)."""
+    stokes, none = np.zeros((1, len(rows), 4)), np.zeros(len(rows))
+    stokes[0, :, 0] = rows[:, 2]
+    return replace(
+        found, ra_rad=np.deg2rad(rows[:, 0]), dec_rad=np.deg2rad(rows[:, 1]), stokes_jy=stokes,
+        place_error_rad=np.zeros((len(rows), 2)), error_jy=0 * stokes, peak_jy=none, major_rad=none, minor_rad=none,
+        angle_rad=none, rms=none, island=none.astype(int), fitted=none == 0,
+    )  # fmt: skip
+
+
 def main():
     cube, truth = field()
     print("| " + " | ".join(HEADS) + " |\n|" + "---|" * len(HEADS))
@@ -99,25 +132,15 @@ def main():
         begin = time.perf_counter()
         found = SourceFinder().find(cube)
         judged(found, truth, time.perf_counter() - begin, "ours")
-    if "--bdsf" in sys.argv:
-        from dataclasses import replace
-
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "image.fits"
-            cube.write(path)
-            os.chdir(folder)
-            for _ in range(2):
-                rows, seconds = by_bdsf(path)
-                stokes = np.zeros((1, len(rows), 4))
-                stokes[0, :, 0] = rows[:, 2]
-                none = np.zeros(len(rows))
-                theirs = replace(
-                    found, ra_rad=np.deg2rad(rows[:, 0]), dec_rad=np.deg2rad(rows[:, 1]), stokes_jy=stokes,
-                    place_error_rad=np.zeros((len(rows), 2)), error_jy=np.zeros((1, len(rows), 4)), peak_jy=none,
-                    major_rad=none, minor_rad=none, angle_rad=none, rms=none, island=none.astype(int),
-                    fitted=none == 0,
-                )  # fmt: skip
-                judged(theirs, truth, seconds, "bdsf")
+        if "--photutils" in sys.argv:
+            rows, seconds = by_photutils(cube)
+            judged(as_ours(found, rows), truth, seconds, "photutils")
+        if "--bdsf" in sys.argv:
+            with tempfile.TemporaryDirectory() as folder:
+                cube.write(Path(folder) / "image.fits")
+                os.chdir(folder)  # where it writes
+                rows, seconds = by_bdsf(Path(folder) / "image.fits")
+            judged(as_ours(found, rows), truth, seconds, "bdsf")
 
 
 if __name__ == "__main__":

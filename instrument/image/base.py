@@ -62,6 +62,7 @@ class AnyImager(Component):
     """
 
     plugin_kind: ClassVar[str | None] = "imagers"
+    restores: ClassVar[bool] = False  # whether what it gives is more than the sums of visibilities: a CLEAN, say
     planes_held: ClassVar[float] = 10  # images a channel, while it works, and of what it gives: for the plan of a run
     planes_made: ClassVar[float] = 5
     pixels: Annotated[int, Field(ge=16, le=32768)]

@@ -16,6 +16,7 @@ from instrument.units import ArrayOf, Count, Jansky, Radians
 class Cleaning(AnyImager):
     """What an imager that cleans is told; `CleanImager` says what each means."""
 
+    restores: ClassVar[bool] = True
     planes_held: ClassVar[float] = 32  # residual, model, its best, PSF and transforms of twice the size
     planes_made: ClassVar[float] = 13
     weighting: Weighting = "natural"

@@ -114,7 +114,7 @@ class Cycles:
             for hunt in hunts:
                 hunt.look(residual, imager)
                 hunt.ended = hunt.ended or "cycles"
-        if any(hunt.ended == "diverging" for hunt in hunts):
+        if any(hunt.ended in ("diverging", "accuracy") for hunt in hunts):
             residual = self._left(given, forward, model, first.freq_hz)
         self._say(hunts, first)
         return self._finished(first, there, residual, model, response, hunts)
@@ -212,7 +212,8 @@ class Cycles:
                 continue
             peak = float(hunt.search.height(hunt.of(residual)).max())
             if not peak <= RISEN * hunt.lowest:
-                hunt.ended = "diverging"
+                # below what the gridder was asked for nothing converges, and nothing is wrong
+                hunt.ended = "accuracy" if peak <= self.imager.accuracy * hunt.first else "diverging"
                 hunt.put(model, hunt.best)
             elif peak < hunt.lowest:
                 hunt.lowest, hunt.best = peak, hunt.of(model)

@@ -78,6 +78,8 @@ def edge(imager: AnyImager) -> Answer:
     """Against the plain sum; digits are those of the worst of four, relative to what was asked."""
     if not hasattr(imager, "accuracy"):
         raise Unfit("it takes no accuracy")
+    if imager.restores:
+        raise Unfit("its images are no sums of visibilities")
     data = _few()
     due = _sum(data, 0.02)
     rms = float(np.sqrt((due**2).mean()))
@@ -181,10 +183,8 @@ def density(_: None) -> Answer:
     return both(*answers)
 
 
-NO_CLEAN, NO_BEAMS = "there is no CLEAN", "there is no imager that knows beams"
+NO_BEAMS = "there is no imager that knows beams"
 MISSING = (
-    not_there("45", "imagers", "CLEAN of gain 2; an all-negative sky", "refused; stops with a reason", NO_CLEAN),
-    not_there("46", "imagers", "I = 0, P alone, joint CLEAN", "no division by I", NO_CLEAN),
     not_there("48", "imagers", "a null of the beam after correction", "masked, noise x kappa stated", NO_BEAMS),
     not_there("49", "imagers", "a cut at a baseline's own length in float32", "the count of float64", "float64 only"),
 )
