@@ -106,7 +106,8 @@ def crowded(stations: int, times: int, pixels: int, count: int, pixel: Any) -> t
     # one at most in each cell, and 2 beams from its rim: a neighbour within the beam is no error of a CLEAN
     side, rim = int(np.ceil(np.sqrt(count))), int(4 / pixel.to_value("arcmin"))
     cell = pixels // side
-    y, x = np.array(np.divmod(rng.permutation(side**2)[:count], side)) * cell + rng.integers(rim, cell - rim, (2, count))
+    cells = np.array(np.divmod(rng.permutation(side**2)[:count], side))
+    y, x = cells * cell + rng.integers(rim, cell - rim, (2, count))
     ra, dec = ImageGrid(pixels=pixels, pixel=pixel, centre=night.phase_centre).at(y.astype(float), x.astype(float))
     flux = np.minimum(0.05 * (1 - rng.uniform(size=count)) ** (-1 / 1.2), 10)
     stokes = flux[:, None] * [1.0, 0.1, -0.05, 0.0]
