@@ -76,19 +76,22 @@ def simplify_sky(full: Problem, chain: Chain, budget: Budget, left_out: list[Ite
 
 
 def _each_member(full: Problem, chain: Chain, budget: Budget, left_out: list[Item]) -> Problem:
-    """A sum of skies without members that give nothing, and of the others what each needs; bounds are of all flux."""
-    total, members = total_flux(full), full.members()
+    """A sum of skies without members that give nothing, and of the others what each needs; bounds are of all flux.
+
+    What is left out of a member is within the budget of its own flux: a faint one is as whole as a bright one.
+    """
+    total, members = total_flux(full) or 1.0, full.members()
+    shares = {name: total_flux(one) / total for name, one in members.items()}
+    each = budget.left / max(1.0, sum(shares.values()))
     kept: dict[str, PlacedSky] = {}
-    for k, (name, one) in enumerate(members.items()):
-        share, said = total_flux(one) / total if total else 0.0, list[Item]()
-        part = budget.left / (len(members) - k)
-        own = Budget(part / share if share else 0.0, 0.0)
+    for name, one in members.items():
+        share, said, own = shares[name], list[Item](), Budget(each, 0.0)
         try:
             kept[name] = simplify_sky(one, chain, own, said).sky
         except InputError:
             left_out.append(Item(name, "no flux, or never above the antenna planes"))
             continue
-        budget.take(part - own.left * share)
+        budget.take(share * (each - own.left))
         left_out += [item._replace(bound=item.bound * share).of(name) for item in said]
     if not kept:
         raise InputError("nothing of the sky is ever above the antenna planes, or it has no flux at all")

@@ -55,8 +55,8 @@ def cheapest(problem: Problem, name: str | None, tolerance: float) -> Choice:
 class Sum(Predictor):
     """Sums of skies (T, F, B, 2, 2): every member by the engine that is cheapest for it, within a part of a tolerance.
 
-    The tolerance is relative to the flux of all, so that a faint member may be wrong by more of its own. Members share
-    it equally; what one does not need goes to those after it, lists of sources first.
+    Each is within the tolerance of its own flux, so that all are within it of the flux of all: a signal of millijansky
+    beside stars of a kilojansky must not be lost in what these may be wrong by.
     """
 
     def refuses(self, problem: Problem) -> str | None:
@@ -65,17 +65,17 @@ class Sum(Predictor):
 
     def prepare(self, problem: Problem, tolerance: float) -> Prepared:
         """The engines of all members, ready; raises `RefusedError` that names the member that none serves."""
-        total, left = total_flux(problem), tolerance
-        waiting = sorted(problem.members().items(), key=lambda entry: entry[1].sky.kind != "points")
+        total, members = total_flux(problem), problem.members()
+        shares = {name: total_flux(one) / total for name, one in members.items()}
+        # the brightest channel of one need not be that of all
+        own = tolerance / max(1.0, sum(shares.values()))
         ready = {}
-        for k, (name, one) in enumerate(waiting):
-            share = total_flux(one) / total
+        for name, one in members.items():
             try:
-                found = cheapest(one, None, left / (len(waiting) - k) / share if share else 0.0)
+                found = cheapest(one, None, own)
             except RefusedError as error:
                 raise RefusedError(f"'{name}' of the sum: {error}") from None
-            left = max(0.0, left - share * found.ready.bound)
-            ready[name] = Member(found.ready, found.label, share)
+            ready[name] = Member(found.ready, found.label, shares[name])
         bound = sum(m.share * m.ready.bound for m in ready.values())
         atoms = [m.ready.atom for m in ready.values()]
         atom = tuple(reduce(np.lcm, sizes).item() for sizes in (np.array(a) for a in zip(*atoms, strict=True)))
