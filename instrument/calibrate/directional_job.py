@@ -223,7 +223,7 @@ def weak_gauges(gauge: Gauge, loose: dict[tuple[int, int], Complex]) -> tuple[Ga
     """
     weak = {}
     for where, generators in loose.items():
-        flat, free = (g.reshape(len(g), -1).view(float) / np.sqrt(2) for g in (generators, gauge.generators))
+        flat, free = (g.reshape(len(g), 4).view(float) / np.sqrt(2) for g in (generators, gauge.generators))
         apart = flat - flat @ free.T @ free
         sizes, rows = np.linalg.svd(apart, full_matrices=False)[1:] if len(flat) else (np.zeros(0), apart)
         found = np.ascontiguousarray(np.sqrt(2) * rows[sizes > 0.5]).view(complex).reshape(-1, 2, 2)

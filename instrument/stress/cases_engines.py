@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,8 +12,10 @@ from instrument.conformance.bench import problems
 from instrument.errors import InputError
 from instrument.jones.feed import FeedTerm
 from instrument.jones.gain import GainTerm
+from instrument.observe.grid import ImageGrid
 from instrument.predict.base import EVERY, Predictor, Problem
 from instrument.predict.operator import ImageOperator
+from instrument.sky.image import ImageSky
 from instrument.stress.bench import fringe, points, problem, references, sums
 from instrument.stress.case import Answer, Unfit, both, case, claim, held, not_there
 from instrument.units import Complex
@@ -201,6 +204,26 @@ def adjoint(engine: Predictor) -> Answer:
         off = abs(float(np.vdot(y, ax).real) - float(np.vdot(x, ready.adjoint(y, EVERY, EVERY))))
         answers.append(Answer(off / float(np.linalg.norm(ax) * np.linalg.norm(y)), 1e-13))
     return both(*answers)
+
+
+@case("50b", "engines", "forward and adjoint of more pixels than are summed at once", "<A x, y> = <x, A^H y>, 1e-13")
+def adjoint_in_pieces(engine: Predictor) -> Answer:
+    """4900 pixels in all Stokes parameters, two baselines."""
+    from astropy import units as u
+
+    given = problems()["an image, phased stations"]
+    shape = (given.shape[1], 4, 70, 70)
+    x = np.random.default_rng(5).normal(size=shape)
+    grid = ImageGrid.of(shape, 2e-3, given.at.centre)
+    sky = ImageSky(grid=grid, stokes=x, frequencies=given.at.freq_hz * u.Hz)
+    given = replace(given, sky=sky, antenna1=given.antenna1[:2], antenna2=given.antenna2[:2])
+    ready = engine.prepare(given, 0.0) if engine.refuses(given) is None else None
+    if not isinstance(ready, ImageOperator):
+        raise Unfit("it takes no images, or has no adjoint")
+    ax = ready.forward(x, EVERY, EVERY)
+    y = ax + np.random.default_rng(6).normal(size=(*ax.shape, 2)).view(complex)[..., 0]
+    off = abs(float(np.vdot(y, ax).real) - float(np.vdot(x, ready.adjoint(y, EVERY, EVERY))))
+    return Answer(off / float(np.linalg.norm(ax) * np.linalg.norm(y)), 1e-13)
 
 
 MISSING = (

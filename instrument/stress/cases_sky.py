@@ -326,3 +326,16 @@ def limits(_: None) -> Answer:
         held(np.asarray(nvss.minor_rad), [0, 0], 0.0, scale=1.0),
         held([nvss.stokes_jy[0, 0], nvss.stokes_jy[1, 0]], [13.9001, 0.05], 1e-12),
     )
+
+
+@case("A1c", "sky", "a table of three sources with spectral indices", "S (f / f0)^a at another frequency, nothing said")
+def indices(_: None) -> Answer:
+    """Indices of -0.7, -0.8 and 0; an inverted median is said, another is not."""
+    text = "name,ra_deg,dec_deg,i_jy,ref_freq_mhz,alpha\n" + "".join(
+        f"s{k},{123 + k},48,{k + 1},150,{a}\n" for k, a in enumerate((-0.7, -0.8, 0.0))
+    )
+    sky, said = _read(text, "three.csv")
+    _other, inverted = _read(text.replace("-0.", "0."), "inverted.csv")
+    due = np.array([1, 2, 3]) * (120 / 150) ** np.array([-0.7, -0.8, 0.0])
+    told = "most spectral indices are positive" in inverted and "positive" not in said
+    return both(held(sky.stokes(np.array([120e6]))[0, :, 0], due, 1e-14), claim(told, f"said '{said}', '{inverted}'"))

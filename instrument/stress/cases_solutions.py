@@ -8,10 +8,12 @@ import numpy as np
 
 from instrument import mat2
 from instrument.calibrate.base import Calibrator
+from instrument.calibrate.gauge import GENERATORS, HELD_TO
 from instrument.stress.bench import observed, points, small_array
 from instrument.stress.case import Answer, Unfit, both, case, claim, held
 from instrument.stress.cases_calibration import STATIONS, changed, gains, left, model_of, noise_like, put, seeds
-from instrument.units import Complex
+from instrument.units import Complex, Float
+from instrument.visibilities import Visibilities
 
 STRONG = points([2.15, 2.17, 2.14], [0.84, 0.85, 0.83], [[9, 5, 2, 3], [3, 0, -2, 1], [1, 0.5, 0, -0.6]])
 PATTERNS = ("full", "diagonal", "scalar", "phase")
@@ -74,6 +76,67 @@ def standard_errors(calibrator: Calibrator) -> Answer:
             answers.append(Answer(abs(float(pull) - 1), 0.12))
         answers.append(Answer(abs(sizes[1] / sizes[0] / 2 - 1), 0.1))
     return both(*answers)
+
+
+def _changes(model: Visibilities, jones: Complex) -> Float:
+    """What each real number of the matrices (A, 2, 2) does to the real numbers of all visibilities, (N, 8 A)."""
+    a, b, columns = model.antenna1, model.antenna2, []
+    for unit in np.eye(8 * len(jones)).reshape(-1, *jones.shape, 2).view(complex)[..., 0]:
+        v = mat2.sandwich(unit[a], model.data, jones[b]) + mat2.sandwich(jones[a], model.data, unit[b])
+        columns.append(np.ascontiguousarray(v).view(float).ravel())
+    return np.array(columns).T
+
+
+def _along(jones: Complex) -> Float:
+    """Steps J G of all stations along common directions (8, 8 A), G those that keep full matrices."""
+    steps = mat2.mul(jones[None], GENERATORS["full"][:, None])
+    return np.asarray(steps.reshape(len(steps), -1).view(float))
+
+
+@case("C0c", "calibrators", "errors of common directions", "those of the dense least squares of one interval, to 5 %")
+def common_errors(calibrator: Calibrator) -> Answer:
+    """Full matrices, 32 integrations; the covariance from a matrix of all derivatives, the free phase taken out."""
+    model, sigma = observed(small_array(STATIONS), STRONG, 32), 0.05
+    jones = gains(0.2, seed=9)
+    data = put(model, jones)
+    data = data.with_data(data.data + noise_like(data.data, sigma))
+    found = changed(calibrator, pattern="full", interval="1920 s").solve(data, model)
+    if found.common_error is None:
+        raise Unfit("it gives no errors of common directions")
+    change, steps = _changes(model, jones[0, 0]), _along(jones[0, 0])
+    values, vectors = np.linalg.eigh(change.T @ change)
+    kept = values > 1e-10 * values[-1]
+    onto = np.linalg.pinv(steps @ steps.T) @ steps @ vectors[:, kept] / np.sqrt(values[kept])
+    due = sigma * np.linalg.svd(onto, compute_uv=False)
+    told = np.sort(found.common_error[0, 0])[::-1]
+    free = claim(bool(np.isinf(told[0]) and np.isfinite(told[1:]).all()), f"infinite of {np.isinf(told).sum()}, due 1")
+    return both(free, held(told[1:], due[:7], 0.05))
+
+
+@case(
+    "C0d", "calibrators", "common directions that noise fills", "data pull away from the start as the prior pulls back"
+)
+def weak_directions(calibrator: Calibrator) -> Answer:
+    """4 % of polarization: along the step from the start, the slope of the misfit over that of the prior stated.
+
+    1 of a fit held by it, 0 of one that is not held at all; below 0 the fit is too far out.
+    """
+    sky = points([2.15, 2.17], [0.84, 0.85], [[9, 0.4, 0, 0], [3, 0, 0.1, 0.05]])
+    model = observed(small_array(STATIONS), sky)
+    turn = mat2.exponential(0.05 * (GENERATORS["full"][1] + GENERATORS["full"][2])[None])
+    data = put(model, np.broadcast_to(turn, (1, 1, STATIONS, 2, 2)))
+    data = data.with_data(data.data + noise_like(data.data, 2.0, seed=3))
+    found = changed(calibrator, pattern="full", interval="240 s").with_fields(tolerance=1e-9).solve(data, model)
+    if not found.converged.all():
+        return claim(False, found.outcome.ravel()[0].name)
+    jones, start = found.jones[0, 0], np.broadcast_to(np.eye(2) + 0j, (STATIONS, 2, 2))
+    steps = _along(start)
+    y = np.linalg.pinv(steps @ steps.T) @ steps @ np.ascontiguousarray(jones - start).view(float).ravel()
+    rest = np.ascontiguousarray(data.data - put(model, jones[None, None]).data).view(float).ravel()
+    slope = 2 * _along(jones) @ _changes(model, jones).T @ rest
+    variance = float(rest @ rest) / (len(rest) - 8 * STATIONS)
+    share = float(slope @ y / (y @ y)) * HELD_TO**2 / (2 * variance)
+    return claim(-0.1 < share < 1.1, f"{share:.2f} of the prior's slope")
 
 
 @case("D1", "calibrators", "only baselines between two groups of three count", "not CONVERGED, or right to 1e-6 on all")
