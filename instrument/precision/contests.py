@@ -7,6 +7,7 @@ from typing import Any
 
 from instrument.errors import InputError, did_you_mean
 from instrument.precision import (
+    beamed,
     calibrators,
     elements,
     engines,
@@ -27,7 +28,8 @@ FULL = Form()
 
 def _engines(plugins: dict[str, Any], form: Form) -> list[Contest]:
     """Those of engines alone, and where other programs are drawn in also those that these can do."""
-    return [*engines.contests(plugins, form), *(plain.contests(plugins, form) if form.peers else ())]
+    beside = (*plain.contests(plugins, form), *beamed.contests(plugins, form)) if form.peers else ()
+    return [*engines.contests(plugins, form), *beside]
 
 
 # kind of plugin -> its contests, of plugins by name

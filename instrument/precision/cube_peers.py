@@ -1,4 +1,4 @@
-"""Programs of others beside what is made of cubes: ducc0 alone, RM-Tools, rm-lite, ps_eor; those that are installed.
+"""Programs of others beside what is made of cubes: ducc0 alone, radiomesh, RM-Tools, rm-lite, ps_eor, as installed.
 
 Each is called in this process as its users call it, its messages left out. What is asked of them is theirs, so that a
 promise they break is no fault of this package.
@@ -16,13 +16,17 @@ from typing import Any
 
 import numpy as np
 
+from instrument.errors import RefusedError
 from instrument.image.cube import StokesCube
+from instrument.mat2 import herm
 from instrument.observe.directions import LIGHT
 from instrument.precision.contest import RIGHT, UNSET, Entry
 from instrument.units import Float
 from instrument.visibilities import Visibilities
 
-IMAGERS, FARADAY, SPECTRA = ("ducc0",), ("rm-tools", "rm-lite"), ("ps_eor",)
+IMAGERS, FARADAY, SPECTRA = ("ducc0", "radiomesh"), ("rm-tools", "rm-lite"), ("ps_eor",)
+DIGITS = tuple(10.0**-k for k in (2, 4, 6, 8, 10, 12))  # asked of radiomesh
+MOST_BYTES = 1e9  # of its grids
 MOST = 100_000  # iterations of RM-CLEAN
 WINDOWS = {None: "boxcar", "hann": "hann", "blackman-harris": "blackmanharris"}  # ours: those of ps_eor
 
@@ -52,7 +56,7 @@ def _entry(name: str, answer: Callable[[float], Any], values: Sequence[float] = 
 
 
 def imager_peers(data: Visibilities, pixels: int, pixel: float, values: Sequence[float]) -> list[Entry]:
-    """ducc0 alone: one call for each Stokes parameter that is not zero, with natural weights."""
+    """ducc0 alone: one call for each Stokes parameter that is not zero, with natural weights; and radiomesh."""
     from ducc0.wgridder.experimental import vis2dirty
 
     def answer(asked: float) -> Float:
@@ -70,7 +74,49 @@ def imager_peers(data: Visibilities, pixels: int, pixel: float, values: Sequence
                 ).T  # fmt: skip
         return np.asarray(planes / weight.sum())
 
-    return [_entry("ducc0 alone (epsilon)", answer, [v for v in values if v >= 1e-12])]
+    found = [_entry("ducc0 alone (epsilon)", answer, [v for v in values if v >= 1e-12])]
+    if find_spec("radiomesh") and find_spec("sympy"):
+        found.append(_entry("radiomesh (digits of its kernel)", _radiomesh(data, pixels, pixel), DIGITS))
+    return found
+
+
+def _radiomesh(data: Visibilities, pixels: int, pixel: float) -> Callable[[float], Float]:
+    """All Stokes parameters in one call, with a kernel of two cells more than digits; it wants w >= 0.
+
+    Where w < 0 it conjugates correlations and then makes V of them, of the wrong sign (0.1.2): baselines are turned
+    before. It compiles its Stokes expressions at every call, half a minute; they are kept from one to the next here.
+    """
+    from radiomesh import core
+
+    turned = data.uvw_m[..., 2:] > 0  # w counts the other way there
+    uvw = np.where(turned, -data.uvw_m, data.uvw_m) * (-1, 1, -1)
+    v = np.where(turned[..., None], herm(data.data[:, 0]), data.data[:, 0])
+    shape = (*v.shape[:2], 1, 4)
+    weight = np.broadcast_to(data.whole_weight, data.data.shape[:3])[:, 0]
+    weights = np.ascontiguousarray(np.broadcast_to(weight[..., None, None], shape))
+    jones = np.ones((len(v), len(data.layout), 1, 1, 2), complex)
+    make, made = core.stokes_funcs, list[Any]()
+
+    def kept(*given: Any) -> Any:
+        if not made:
+            made.append(make(*given))
+        return made[0]
+
+    def answer(asked: float) -> Float:
+        deep = np.ptp(np.abs(uvw[..., 2])) * data.freq_hz[0] / LIGHT * 2 * (pixels * pixel) ** 2 / 2  # planes in w
+        if (size := 16 * 4 * 4.0 * pixels**2 * (deep + 12)) > MOST_BYTES:
+            raise RefusedError(f"its planes in w take {size / 1e9:.1f} GB at once, and as much again")
+        core.stokes_funcs = kept
+        try:
+            planes = core.vis2im_wgrid(
+                uvw, data.freq_hz[:1], v.reshape(shape), weights, np.zeros(shape, bool), jones, data.antenna1,
+                data.antenna2, pixels, pixels, pixel, pixel, "linear", "IQUV", 4, alpha=2 + round(-np.log10(asked)),
+            )  # fmt: skip
+        finally:
+            core.stokes_funcs = make
+        return np.asarray(np.swapaxes(planes, 1, 2) / (2 * weight.sum()))
+
+    return answer
 
 
 # Faraday depth ----------------------------------------------------------------------------------------------------

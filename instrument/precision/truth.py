@@ -112,6 +112,8 @@ def geometry(at: Any) -> Any:
     old = unit(turned[:, 2])
     k = np.cross(old, centre)[:, None]
     axes = turned + np.cross(k, turned) + np.cross(k, np.cross(k, turned)) / (1 + dot(old, centre))[:, None, None]
+    if at.seen_east is not None:  # in the frames of another program
+        seen, east, centre = real(at.seen), real(at.seen_east), real(at.seen_centre)
     local = dot(real(at.layout.axes)[None, :, None], seen[:, None, :, None])
     p, q, r = np.moveaxis(local, -1, 0)
     rho = np.sqrt(p * p + q * q)
