@@ -154,7 +154,7 @@ def test_the_output_in_a_file_is_the_same(tmp_path):
     assert np.array_equal(found.data, Analyzer(polarized(p)).rm_synthesis(WIDE).data)
     assert np.array_equal(np.load(tmp_path / "f.npy").reshape(found.data.shape), found.data)
     assert said == sorted(said) and said[-1] == 1
-    assert np.array_equal(found.clean(cutoff=0.2).iterations.shape, (40, 50))  # read-only data will do
+    assert np.array_equal(found.clean(cutoff=0.6).iterations.shape, (40, 50))  # read-only data will do
 
 
 def test_a_file_is_not_there_when_synthesis_fails(tmp_path):
@@ -459,7 +459,7 @@ def test_clean_is_the_plain_loop_with_the_rmsf_of_each_pixel(axis):
 
 def test_clean_in_single_precision_agrees_with_double():
     rng = np.random.default_rng(19)
-    p = thin(rng.uniform(-9, 9, (6, 40)), PAPER) + 0.1 * noise(rng, 161, 6, 40)
+    p = thin(rng.uniform(-9, 9, (6, 16)), PAPER) + 0.1 * noise(rng, 161, 6, 16)
     one, two = (
         Analyzer(polarized(p, PAPER)).rm_synthesis(WIDE, precision=x).clean(cutoff=0.1) for x in ("single", "double")
     )

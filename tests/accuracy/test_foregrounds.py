@@ -79,9 +79,10 @@ def test_four_components_take_the_quiet_leakage_down_a_hundred_times_and_touch_n
     assert split("gmca", "quiet").score(foreground=case("quiet")[1]).value < 1 / 100
 
 
-def test_more_components_leave_less():
-    six = load("gmca", components=6).split(case("quiet")[0]).score(foreground=case("quiet")[1]).value
-    assert six < split("gmca", "quiet").score(foreground=case("quiet")[1]).value / 3
+@pytest.mark.parametrize("name", ["pca", pytest.param("gmca", marks=pytest.mark.long)])
+def test_more_components_leave_less(name):
+    six = load(name, components=6).split(case("quiet")[0]).score(foreground=case("quiet")[1]).value
+    assert six < split(name, "quiet").score(foreground=case("quiet")[1]).value / 3
 
 
 def test_under_white_noise_the_published_scheme_removes_nothing():
