@@ -77,7 +77,12 @@ def flux_at(cube, east=5, north=3):
 
 @pytest.mark.parametrize(
     "settings",
-    [{}, {"peaks": "joint"}, {"peaks": "I"}, {"terms": 1}, {"terms": 2, "peaks": "joint"}, {"weighting": "uniform"}],
+    [
+        {},
+        {"terms": 2, "peaks": "joint"},
+        *(pytest.param(s, marks=pytest.mark.long) for s in ({"peaks": "joint"}, {"peaks": "I"}, {"terms": 1})),
+        pytest.param({"weighting": "uniform"}, marks=pytest.mark.long),
+    ],
     ids=str,
 )
 def test_model_and_restored_image_have_the_fluxes_and_the_residual_has_none(settings):
