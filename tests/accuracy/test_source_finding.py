@@ -162,3 +162,12 @@ def test_an_island_that_takes_too_long_is_said():
     with pytest.warns(InstrumentWarning, match="not fitted within 1e-09 s"):
         found = SourceFinder(seconds=1e-9 * u.s).find(cube)
     assert not found.fitted.any()
+
+
+def test_a_faint_source_beside_one_of_1e8_times_the_noise_is_found_and_both_are_right():
+    sources = [(40.3, 50.2, (1e5, 0, 0, 0)), (130.4, 120.7, (0.1, 0, 0, 0))]
+    cube = field(sources)
+    found = SourceFinder().find(cube)
+    beside = found.against(truth(cube, sources), 10 * u.arcsec)
+    assert beside.completeness == 1 and len(found) == 2
+    assert abs(found.stokes_jy[0, 0, 0] - 1e5) < 0.1 and abs(found.stokes_jy[0, 1, 0] - 0.1) < 0.01

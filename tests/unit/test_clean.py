@@ -202,3 +202,19 @@ def test_dynamic_range_of_1e8_is_reached_where_accuracy_is_asked_for():
     made = CleanImager(**SIZE, accuracy=1e-12, cycles=20, threshold=1e-3 * u.Jy).imaged(both)
     assert np.abs(flux_at(made.cube, -6, -4)[:, 0] - 1).max() < 1e-3
     assert np.abs(flux_at(made.cube)[:, 0] - 1e8).max() < 1e-3
+
+
+def test_what_holds_nothing_is_refused_and_one_time_or_baseline_is_said():
+    data = seen()
+    with pytest.raises(InputError, match="no visibility lies within"):
+        CleanImager(**SIZE).image(data.flagged(np.ones((1, 1, 1), bool)))
+    with pytest.raises(InputError, match="no visibility lies within"):
+        CleanImager(**SIZE, uv_range=(1e5, 2e5)).image(data)
+    with pytest.raises(InputError, match="must be even"):
+        CleanImager(pixels=31, pixel=PIXEL)
+    with pytest.raises(InputError, match="go over the visibilities twice"):
+        CleanImager(**SIZE).image(iter([data]))
+    flag = np.ones(data.data.shape[:3], bool)
+    flag[:, :, 5] = False
+    with pytest.warns(InstrumentWarning, match="nothing is cleaned there"):
+        assert np.isfinite(CleanImager(**SIZE).image(data.flagged(flag)).data).all()
