@@ -143,6 +143,11 @@ class AnyImager(Component):
         """Sums to which blocks are added one by one."""
         return Kept(self)
 
+    @property
+    def passes(self) -> int:
+        """How often it goes through the visibilities at most, for the seconds of a plan."""
+        return 1
+
     def error(self) -> str:
         """How wrong its images may be, in words."""
         return ""

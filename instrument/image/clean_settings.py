@@ -58,6 +58,11 @@ class Cleaning(AnyImager):
         return self
 
     @property
+    def passes(self) -> int:
+        """The first images, and those of each cycle."""
+        return self.cycles + 1
+
+    @property
     def dirty(self) -> Imager:
         """What makes its dirty images."""
         from astropy import units as u

@@ -88,7 +88,7 @@ def imaging(imager: AnyImager, run: Running, count: int = 1) -> StageWork:
         return StageWork(
             f"{count_of(count * channels, 'image')} of {imager.pixels} x {imager.pixels} by {type(imager).__name__}, "
             f"from {si_prefix(64 * count * run.visibilities, 'B')} of files",
-            seconds=count * KEEPING * run.visibilities,
+            seconds=count * imager.passes * KEEPING * run.visibilities,
             block_bytes=3 * 64.0 * float(np.prod(run.block)),
             finish_bytes=count * imager.planes_held * channels * plane,
             result_bytes=count * imager.planes_made * channels * plane,
