@@ -29,7 +29,7 @@ AT = Direction(2.15, 0.84)
 MHZ = np.linspace(140, 146, 16)
 
 
-def white(seed, rms=1.0, shape=(16, 24, 24)):
+def white(seed, rms=1.0, shape=(12, 16, 16)):
     data = np.zeros((shape[0], 4, *shape[1:]))
     data[:, 0] = rms * np.random.default_rng(seed).normal(size=shape)
     return StokesCube(data, np.linspace(140, 143, shape[0]) * u.MHz, 4 * u.arcmin, "K")
@@ -55,10 +55,10 @@ def test_what_came_through_whole_has_ratio_and_transfer_of_one_and_half_of_it_a_
 
 
 def test_the_scatter_that_is_said_is_that_over_many_foregrounds_and_noises():
-    """0.8 of a signal under something of three times its power, 60 draws of both that and noise."""
+    """0.8 of a signal under something of three times its power, 40 draws of both that and noise."""
     signal = white(1)
     ratios, transfers, said, unit = [], [], [], []
-    for seed in range(60):
+    for seed in range(40):
         noise, same = white(500 + seed, 0.6).data, white(900 + seed, 0.6)
         total = signal.with_data(0.8 * signal.data + white(100 + seed, np.sqrt(3)).data + noise)
         found = recovered_power(total, signal, noise=same, bins=4)
@@ -67,7 +67,7 @@ def test_the_scatter_that_is_said_is_that_over_many_foregrounds_and_noises():
         unit.append(found.noise.power / 0.36 / found.injected.power)  # of rms 1, over the power of this one signal
     sigma = np.sqrt(np.mean(np.square(said), axis=0))
     for values, due, expected in zip((ratios, transfers), (0.64 + 3 * np.mean(unit, axis=0), 0.8), sigma, strict=True):
-        pull = (np.mean(values, axis=0) - due) / (expected / np.sqrt(60))
+        pull = (np.mean(values, axis=0) - due) / (expected / np.sqrt(40))
         assert np.abs(pull).max() < 4
         assert np.std(values, axis=0, ddof=1) / expected == pytest.approx(np.ones(4), abs=0.35)
 
@@ -82,7 +82,7 @@ def test_tables_are_written_and_cubes_that_do_not_fit_are_refused(tmp_path):
     jansky = StokesCube(signal.data, signal.freq_hz * u.Hz, 4 * u.arcmin, "Jy/pixel")
     for other, said in (
         (jansky, "cubes are in K and Jy/pixel"),
-        (white(1, shape=(16, 20, 24)), "pixels|shape"),
+        (white(1, shape=(12, 20, 16)), "pixels|shape"),
         (signal.with_data(0 * signal.data), "nothing was injected in Stokes I"),
     ):
         with pytest.raises(InputError, match=said):

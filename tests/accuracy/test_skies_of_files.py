@@ -119,7 +119,9 @@ def healpix_map(nside, frame, convention, nested=False):
     return found
 
 
-@pytest.mark.parametrize(("frame", "convention"), [("icrs", "IAU"), ("galactic", "COSMO")])
+@pytest.mark.parametrize(
+    ("frame", "convention"), [("galactic", "COSMO"), pytest.param("icrs", "IAU", marks=pytest.mark.long)]
+)
 def test_a_map_has_its_polarization_relative_to_icrs_north_in_iau(frame, convention):
     """At nside 128 what lies between pixels of 27' for waves of 12 deg is 4e-3; it falls as their square."""
     grid = ImageGrid(pixels=(40, 31), pixel=15 * u.arcmin, centre=AT)

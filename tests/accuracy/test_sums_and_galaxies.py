@@ -199,11 +199,11 @@ def test_the_galaxy_beside_stars_goes_through_the_gridded_engine_within_the_tole
 
 
 def test_what_the_galaxy_takes_while_it_is_summed_was_planned():
-    """96 x 96 pixels, two channels: no images of all channels, and the fields of ten screens are counted."""
-    sky = Galaxy(pixels=96, pixel=2 * u.arcmin, seed=11)
+    """64 x 64 pixels, two channels: no images of all channels, and the fields of ten screens are counted."""
+    sky = Galaxy(pixels=64, pixel=3 * u.arcmin, seed=11)
     plan = Scene(instrument=lofar(), sky=sky, observation=NIGHT).plan()
     plan.ready.sums(slice(0, 1), slice(0, 1))  # compiled and imported
-    again = Scene(instrument=lofar(), sky=Galaxy(pixels=96, pixel=2 * u.arcmin, seed=12), observation=NIGHT)
+    again = Scene(instrument=lofar(), sky=Galaxy(pixels=64, pixel=3 * u.arcmin, seed=12), observation=NIGHT)
     tracemalloc.start()
     try:
         fresh = again.plan()
