@@ -73,10 +73,10 @@ def on(grid, waves):
 
 def moved(per_wave):
     """Largest error over the peak, and what is said, of an image with so many pixels a wave."""
-    pixel = 0.05 / per_wave
+    pixel = 0.005 / per_wave
     grid = ImageGrid.of((160, 160), pixel, AT)
     other = ImageGrid.of((80, 80), 0.9 * pixel, Direction(AT.ra_rad + 15.3 * pixel, AT.dec_rad - 10.7 * pixel))
-    waves = 2 * np.pi / 0.05
+    waves = 2 * np.pi / 0.005
     found = reprojected(ImageSky(grid=grid, stokes=(on(grid, waves) * solid_angles(grid))[None]), other)
     due = on(other, waves)
     error = np.abs(found.stokes[0] / solid_angles(other) - due).max() / np.abs(due).max()
@@ -115,7 +115,7 @@ def main():
     )
     head = ["seed", "peak, rad/m2", *(f"at {d}" for d in DEPTHS), "rms of P in a channel", "slope at 134, 150, 166 MHz"]
     table(head, [galaxy(seed, *size) for seed in (196, 1, 2, 3)])
-    print("\nAn image of waves of 0.05 rad on another grid; errors over the peak.")
+    print("\nAn image of waves of 17 arcmin on another grid; errors over the peak.")
     table(["pixels a wave", "largest error", "said"], [moved(n) for n in (3, 4, 6, 8, 12, 16)])
     print("\nA HEALPix map in galactic coordinates and COSMO on a grid of ICRS, waves of 12 deg; errors over the rms.")
     table(["nside", "rms error", "said"], [mapped(n) for n in (32, 64, 128, 256, 512)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Annotated, Any, Self
 
 import numpy as np
@@ -71,8 +72,14 @@ class Galaxy(ImageMaker):
 
     def masked(self) -> Any:
         """The pixels within the discs, bool (N, N)."""
-        y, x = np.ogrid[: self.pixels, : self.pixels]
-        out = np.zeros((self.pixels, self.pixels), bool)
-        for at in np.random.default_rng([self.seed, 2]).uniform(0, self.pixels, (self.discs, 2)):
-            out |= np.hypot(y - at[0], x - at[1]) <= self.disc / self.pixel
-        return out
+        return _masked(self.pixels, self.disc / self.pixel, self.discs, self.seed)
+
+
+@lru_cache(maxsize=2)
+def _masked(pixels: int, radius: float, discs: int, seed: int) -> Any:
+    """Pixels within a radius, in pixels, of random places, bool (N, N)."""
+    y, x = np.ogrid[:pixels, :pixels]
+    out = np.zeros((pixels, pixels), bool)
+    for at in np.random.default_rng([seed, 2]).uniform(0, pixels, (discs, 2)):
+        out |= np.hypot(y - at[0], x - at[1]) <= radius
+    return out
