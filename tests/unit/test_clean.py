@@ -1,15 +1,21 @@
 """CLEAN: what it finds, where it looks, and how it ends."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from astropy import units as u
 
-from instrument import CleanImager, Imager, InputError
+from instrument import CleanImager, ImageGrid, Imager, InputError, PointSky, read_cube
 from instrument.conformance.imagers import _seen
 from instrument.errors import InstrumentWarning
 from instrument.image.minor import Lobes, Search, minor_cycle, spectral_fit
+from instrument.pipeline.run import run
+from instrument.pipeline.scene_file import parse
+from instrument.pipeline.scene_text import override, read_tables
+from instrument.stress.bench import observed, small_array
+from instrument.units import Direction
 
 PIXEL = 6 * u.arcmin
 SIZE = {"pixels": 32, "pixel": PIXEL}
@@ -218,3 +224,47 @@ def test_what_holds_nothing_is_refused_and_one_time_or_baseline_is_said():
     flag[:, :, 5] = False
     with pytest.warns(InstrumentWarning, match="nothing is cleaned there"):
         assert np.isfinite(CleanImager(**SIZE).image(data.flagged(flag)).data).all()
+
+
+@pytest.mark.parametrize("terms", [2, pytest.param(4, marks=pytest.mark.long)])
+def test_joined_channels_find_a_spectrum_that_is_a_polynomial_in_frequency(terms):
+    """Four channels whose PSFs differ by a third, fluxes on a line: two terms are enough."""
+    layout = small_array(16, spread=90.0)
+    freq = (120.0, 135.0, 150.0, 160.0)
+    grid = ImageGrid.of((64, 64), 4e-3, Direction(2.15, 0.84))
+    ra, dec = grid.at(np.array([40.0, 20.0]), np.array([25.0, 44.0]))
+    sky = PointSky(
+        names=("a", "b"), ra_rad=ra, dec_rad=dec, stokes_jy=[[2, 0.2, 0, 0], [1, 0, 0, 0]],
+        reference_hz=[150e6, 150e6], spectral_terms=[[-1.5], [0.5]], logarithmic=[False, False],
+    )  # fmt: skip
+    data = observed(layout, sky, 8, freq, interval=3000.0)
+    due = sky.stokes(np.array(freq) * 1e6)
+    imager = CleanImager(pixels=64, pixel=4e-3 * u.rad, terms=terms, cycles=8)
+    found = imager.imaged(data).beside["model"].data[:, :, [40, 20], [25, 44]]
+    assert np.abs(np.moveaxis(found, 1, 2) - due).max() < 2e-3
+    one = imager.with_fields(terms=1).imaged(data)
+    spread = np.ptp(one.beside["model"].data[:, 0, 40, 25])
+    # the peak of a PSF is 1 to the accuracy of the gridding
+    assert spread < 1e-6 and np.abs(one.beside["residual"].data[0, 0]).max() > 0.1
+
+
+@pytest.mark.long
+def test_a_scene_that_cleans_writes_model_and_residual_and_says_how_it_ended(tmp_path):
+    stations = [f"CS{k:03d}HBA0" for k in range(2, 8)] + ["CS302HBA1"]
+    words = [
+        f"instrument.stations={stations}", "observation.duration='60 min'", "observation.interval='20 min'",
+        "sky.shape=[3, 3]", "image.kind='clean'", "image.pixels=64", "image.pixel='1 arcmin'",
+        "image.uv_range=[1, 900]", "image.threshold='0.5 Jy'", "image.cycles=3",
+    ]  # fmt: skip
+    tables = override(read_tables("mock-grid"), words)
+    run(parse(tables), tables, out=str(tmp_path / "out"), verify=False)
+    cube, model, residual = (read_cube(tmp_path / "out" / f"{n}.fits") for n in ("cube", "model", "residual"))
+    assert model.unit == "Jy/pixel" and residual.unit == cube.unit == "Jy/beam"
+    # the restored image is the residual and the model under the beam: elsewhere nothing
+    at = np.unravel_index(np.argmax(model.data[0, 0]), (64, 64))
+    assert cube.data[0, 0][at] - residual.data[0, 0][at] >= 0.999 * model.data[0, 0][at] > 0
+    said = json.loads((tmp_path / "out" / "run.json").read_text())["image"]
+    assert {end["stokes"] for end in said["clean"]} == {"I", "QU", "V"}
+    assert all(end["ended"] for end in said["clean"]) and set(said["solid_angle_sr"]) == {"fit", "sum"}
+    with pytest.raises(InputError, match=r"\[image\] .*gain of 3"):
+        parse(override(tables, ["image.gain=3.0"]))
