@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from instrument.errors import InputError, warn
+from instrument.observe.clock import later, terrestrial
 from instrument.observe.orientation import orientation
 from instrument.units import Direction, Float, Int
 
@@ -97,7 +98,7 @@ def earth_frame(times: Any, site_m: Float) -> EarthFrame:
         )
     ut1_utc, xp, yp = (np.where(outside, 0.0, found) for found in (ut1_utc, xp, yp))
     ut1 = erfa.utcut1(jd1, jd2, ut1_utc)
-    tt = np.atleast_1d(times.tt.jd1), np.atleast_1d(times.tt.jd2)
+    tt = terrestrial(times)
     matrices = erfa.c2t06a(*tt, *ut1, xp, yp)
     _, barycentric = erfa.epv00(*tt)
     spin = np.cross([0.0, 0.0, EARTH_RATE], site_m)
@@ -155,16 +156,21 @@ def transit_time(centre: Direction, site_m: Float, date: str) -> Any:
         raise InputError(f"transit = '{date}' is not a day; write it like '2012-12-07'") from None
     longitude = np.arctan2(site_m[1], site_m[0])
     sidereal = 86164.0905
-    time = day + 12 * u.hour
+    time = later(day, 12 * u.hour)
 
     def hour_angle(t: Any) -> float:
         d = earth_frame(t, site_m).itrf(centre.vector[None])[0, 0]
         return float((longitude - np.arctan2(d[1], d[0]) + np.pi) % (2 * np.pi) - np.pi)
 
     for _ in range(5):
-        time = time - hour_angle(time) / (2 * np.pi) * sidereal * u.s
-    while time < day:
-        time = time + sidereal * u.s
-    while time >= day + 1 * u.day:
-        time = time - sidereal * u.s
-    return time - hour_angle(time) / (2 * np.pi) * sidereal * u.s
+        time = later(time, -hour_angle(time) / (2 * np.pi) * sidereal * u.s)
+    while _days(time, day) < 0:
+        time = later(time, sidereal * u.s)
+    while _days(time, day) >= 1:
+        time = later(time, -sidereal * u.s)
+    return later(time, -hour_angle(time) / (2 * np.pi) * sidereal * u.s)
+
+
+def _days(time: Any, day: Any) -> float:
+    """Days of UTC from one time to another."""
+    return float((time.jd1 - day.jd1) + (time.jd2 - day.jd2))

@@ -11,6 +11,7 @@ from instrument.checked import checked
 from instrument.component import Component
 from instrument.errors import InputError, RefusedError
 from instrument.memory import afford
+from instrument.observe.clock import later
 from instrument.observe.directions import transit_time
 from instrument.observe.layout import Layout
 from instrument.units import Float, Hertz, HertzArray, Instant, Seconds, SkyDirection
@@ -99,9 +100,8 @@ class Observation(Component):
         from astropy import units as u
 
         if self.transit is not None:
-            begin = (
-                transit_time(self.phase_centre, layout.centre_m, self.transit) - self.count * self.interval / 2 * u.s
-            )
+            middle = transit_time(self.phase_centre, layout.centre_m, self.transit)
+            begin = later(middle, -self.count * self.interval / 2 * u.s)
         else:
             begin = self.start
-        return begin + (np.arange(self.count) + 0.5) * self.interval * u.s
+        return later(begin, (np.arange(self.count) + 0.5) * self.interval * u.s)

@@ -28,7 +28,7 @@ from instrument.scene import Scene
 from instrument.units import si_prefix
 
 HALVINGS = 12  # of blocks until the run fits
-LIBRARIES = 120e6  # bytes of numba, compiled loops and the libraries that stages load at their first block
+LIBRARIES = 130e6  # bytes of numba, compiled loops and the libraries that stages load at their first block
 PAGE_BYTES, PAGE_SECONDS, FIGURE_SECONDS = 120e6, 0.8, 0.7  # matplotlib and jinja2 loaded; a figure, day and night
 
 

@@ -302,7 +302,7 @@ def test_a_plan_loads_no_library_that_it_does_not_need():
     script = "from instrument.cli import main\nassert main(['plan', 'mock-grid']) == 0"
     loaded = python(f"{script}\nimport sys\nprint('LOADED', *sys.modules)").rpartition("LOADED")[2].split()
     assert {"numpy", "instrument.planner", "instrument.phasor"} <= set(loaded)
-    needless = {"numba", "scipy", "ducc0", "h5py", "matplotlib", "jinja2", "astropy.coordinates"}
+    needless = {"numba", "scipy", "ducc0", "h5py", "matplotlib", "jinja2", "astropy.coordinates", "astropy.table"}
     assert needless & set(loaded) == set()
 
 
