@@ -54,6 +54,7 @@ def test_what_came_through_whole_has_ratio_and_transfer_of_one_and_half_of_it_a_
     np.testing.assert_allclose(upside.transfer[there], -1, rtol=1e-12)  # the right power, and none of the signal
 
 
+@pytest.mark.long
 def test_the_scatter_that_is_said_is_that_over_many_foregrounds_and_noises():
     """0.8 of a signal under something of three times its power, 40 draws of both that and noise."""
     signal = white(1)

@@ -198,6 +198,7 @@ def test_the_galaxy_beside_stars_goes_through_the_gridded_engine_within_the_tole
     assert check.passed and check.bound <= 1e-5
 
 
+@pytest.mark.long
 def test_what_the_galaxy_takes_while_it_is_summed_was_planned():
     """64 x 64 pixels, two channels: no images of all channels, and the fields of ten screens are counted."""
     sky = Galaxy(pixels=64, pixel=3 * u.arcmin, seed=11)
