@@ -1,4 +1,4 @@
-"""Imager: dirty images of I, Q, U, V and the PSF, on ducc0's w-gridder, block by block."""
+"""Imager: dirty images of I, Q, U, V and the PSF, by ducc0's w-gridder, of few samples where times allow."""
 
 from __future__ import annotations
 
@@ -12,12 +12,16 @@ from pydantic import Field
 from instrument.checked import checked
 from instrument.errors import InputError, RefusedError, warn
 from instrument.image.base import AnyImager, ImageSums
+from instrument.image.clock import Clock
 from instrument.image.cube import StokesCube
 from instrument.image.psf import fit_psf
+from instrument.image.sparse import FEW, Comb, Span
 from instrument.image.weights import Density, Weighting
+from instrument.jones import mueller
 from instrument.observe.directions import LIGHT
+from instrument.predict.gridding import Gridder
 from instrument.predict.operator import ImageOperator
-from instrument.units import Complex, Float
+from instrument.units import Complex, Float, Int
 from instrument.visibilities import Visibilities, VisibilitySet
 from instrument.visibility_sets import as_set
 
@@ -85,12 +89,17 @@ class Imager(AnyImager):
 
 
 class _Channel:
-    """Images of one channel: visibilities waiting to be gridded, and what has been."""
+    """Images of one channel: visibilities that wait, sums at samples, and what has been gridded."""
 
     def __init__(self, freq_hz: float, pixels: int) -> None:
         self.freq_hz, self.pixels = freq_hz, pixels
-        self.waiting: list[tuple[Float, Float, Complex]] = []
-        self.count = 0
+        self.waiting: list[tuple[Visibilities, int, Int | None]] = []  # blocks, the channel in them, their integrations
+        self.count = 0  # visibilities that wait
+        self.times = 0  # integrations that wait
+        self.comb: Comb | None = None  # once visibilities go to samples
+        self.most = 0  # samples
+        self.span: Span | None = None
+        self.sparse = True  # as far as is known
         self.weight = np.zeros(4)  # of I, Q, U, V
         self.crossed: Float | None = None  # the PSF of U and V (N, N), where their weights are not those of I and Q
 
@@ -98,6 +107,11 @@ class _Channel:
     def sums(self) -> Float:
         """Of I, Q, U, V and the PSF (5, N, N); there from the first gridding on."""
         return np.zeros((5, self.pixels, self.pixels))
+
+    @property
+    def samples(self) -> int:
+        """How many are held."""
+        return self.span.samples.count if self.span else 0
 
 
 class Images(ImageSums):
@@ -109,6 +123,7 @@ class Images(ImageSums):
         self.lobes = lobes
         self.channels: dict[float, _Channel] = {}
         self.centre: Any = None
+        self.clock: Clock | None = None
         self.waiting = 0  # visibilities, in all channels
 
     def add(self, block: Visibilities) -> None:
@@ -116,66 +131,131 @@ class Images(ImageSums):
         self.centre = self.centre or block.phase_centre
         if block.phase_centre != self.centre:
             raise InputError("blocks with different phase centres cannot be imaged together")
-        stokes = None
-        for f, freq in enumerate(block.freq_hz):
-            channel = self.channels.setdefault(float(freq), _Channel(float(freq), self.imager.pixels))
-            uvw, weight, use = self.imager.chosen_stokes(block, f)
-            if not len(weight):
+        times, _, baselines = block.data.shape[:3]
+        if not times * baselines:
+            return
+        self.clock = self.clock or Clock(block)
+        numbers = self.clock.count(block)
+        here = [
+            self.channels.setdefault(float(freq), _Channel(float(freq), self.imager.pixels)) for freq in block.freq_hz
+        ]
+        for f, channel in enumerate(here):
+            if channel.comb is not None and numbers is not None:
+                self._compress(channel, block, f, numbers)
                 continue
-            if self.density is not None:
-                factor = self.density[float(freq)].factor(uvw[:, :2], self.imager.weighting, self.imager.robust)
-                weight = weight * factor
-            stokes = block.stokes() if stokes is None else stokes
-            # of no weight, the data may be NaN
-            channel.waiting.append((uvw, weight, np.where(weight > 0, stokes[:, f][use], 0.0)))
-            channel.count += len(weight)
-            self.waiting += len(weight)
-            if channel.count >= HELD:
-                self._grid(channel)
+            channel.waiting.append((block, f, numbers))
+            channel.sparse = channel.sparse and numbers is not None
+            channel.count, channel.times = channel.count + times * baselines, channel.times + times
+            self.waiting += times * baselines
+            if channel.count >= HELD or (channel.sparse and channel.times > FEW):
+                self._take(channel)
         while self.waiting > ALL_HELD:
-            self._grid(max(self.channels.values(), key=lambda c: c.count))
+            self._take(max(self.channels.values(), key=lambda c: c.count))
+        while sum(channel.samples for channel in self.channels.values()) > max(
+            ALL_HELD, len(self.channels) * self._few
+        ):
+            self._close(max(self.channels.values(), key=lambda c: c.samples))
+
+    @property
+    def _few(self) -> int:
+        """Samples that a channel may hold in any case: as large as two and a half of its images."""
+        return self.imager.pixels**2 // 4
+
+    def _take(self, channel: _Channel) -> None:
+        """Bring what waits to samples where that pays, or grid it as it is."""
+        if channel.sparse and channel.comb is None:
+            assert self.clock is not None
+            comb = Comb.of(self.clock, channel.freq_hz, self.imager)
+            channel.most = min(HELD, max(ALL_HELD // len(self.channels), self._few))
+            channel.sparse = comb.span(0, channel.most) is not None
+            channel.comb = comb if channel.sparse else None
+        if not channel.sparse:
+            return self._grid(channel)
+        for block, f, numbers in channel.waiting:
+            assert numbers is not None
+            self._compress(channel, block, f, numbers)
+        self._taken(channel)
+
+    def _taken(self, channel: _Channel) -> None:
+        self.waiting -= channel.count
+        channel.waiting, channel.count, channel.times = [], 0, 0
+
+    def _compress(self, channel: _Channel, block: Visibilities, f: int, numbers: Int) -> None:
+        """Add a channel of a block to its samples, span by span."""
+        assert channel.comb is not None
+        weight, flag = self._weights(block, f)
+        uv = block.at.uvw_m[..., :2] * (channel.freq_hz / LIGHT)
+        left = np.sort(numbers)
+        while len(left):
+            if channel.span is None or not channel.span.first <= left[0] < channel.span.last:
+                self._close(channel)
+                channel.span = channel.comb.span(int(left[0]), channel.most)
+                assert channel.span is not None  # as before, elsewhere
+            channel.span.add(block.data[:, f], weight, flag, numbers, uv, self.imager.uv_range)
+            left = left[left >= channel.span.last]
+
+    def _weights(self, block: Visibilities, f: int) -> tuple[Any, Any]:
+        """Weights (T, B, 1 or 4) and flags (T, B) of a channel of a block; for the whole uv range where natural."""
+        shape = block.data.shape[0], block.data.shape[2]
+        weight, flag = (x[:, f if x.shape[1] > 1 else 0] for x in (block.weight, block.flag))
+        if self.density is None and weight.ndim == flag.ndim == len(shape):
+            return np.broadcast_to(weight[..., None], (*shape, 1)), np.broadcast_to(flag, shape)
+        _, found, use = self._chosen(block, f)
+        full = np.zeros((*shape, found.shape[1]))
+        full[use] = found
+        return full, np.broadcast_to(np.zeros((), bool), shape)
+
+    def _chosen(self, block: Visibilities, f: int) -> tuple[Float, Float, Any]:
+        """Baselines in wavelengths (N, 3), their weights (N, 1 or 4), and which ones (T, B) they are."""
+        uvw, weight, use = self.imager.chosen_stokes(block.block(slice(None), slice(f, f + 1)), 0)
+        if self.density is not None:
+            density = self.density[float(block.freq_hz[f])]
+            weight = weight * density.factor(uvw[:, :2], self.imager.weighting, self.imager.robust)
+        return uvw, weight, use
 
     def _grid(self, channel: _Channel) -> None:
-        """Sum_k w_k V_k exp(+2 pi i (u l + v m + w (n-1))), real part, for I, Q, U, V and for V = 1."""
-        if not channel.count:
+        """Grid what waits, visibility by visibility."""
+        found = []
+        for block, f, _ in channel.waiting:
+            uvw, weight, use = self._chosen(block, f)
+            # of no weight, the data may be NaN
+            values = np.where(weight > 0, mueller.stokes(block.data[:, f][use]), 0.0)
+            found.append((uvw, weight, values))
+        self._taken(channel)
+        most = max((weight.shape[1] for _, weight, _ in found), default=1)
+        found = [(uvw, np.broadcast_to(w, (len(w), most)), values) for uvw, w, values in found if len(w)]
+        if not found:
             return
-        from ducc0.wgridder.experimental import vis2dirty
-
-        most = max(weight.shape[1] for _, weight, _ in channel.waiting)
-        waiting = ((uvw, np.broadcast_to(w, (len(w), most)), values) for uvw, w, values in channel.waiting)
-        uvw, weight, stokes = (np.concatenate(parts) for parts in zip(*waiting, strict=True))
-        columns, images = [*np.moveaxis(stokes, -1, 0)], [*channel.sums]
-        if self.lobes:
-            columns.append(np.ones(len(weight), complex))
-        if self.lobes and (most > 1 or channel.crossed is not None):
-            channel.crossed = images[4].copy() if channel.crossed is None else channel.crossed  # alike until now
-            images, columns = [*images, channel.crossed], [*columns, columns[-1]]
-        weights = np.broadcast_to(weight, (len(weight), 4)).T
-        for image, values, k in zip(images, columns, (0, 1, 2, 3, 0, 2), strict=False):
-            if not values.any():  # a Stokes parameter that is exactly zero
-                continue
-            # ducc0 has exp(+2 pi i (u l + v m - w (n-1))) for the adjoint: flip w; x to the west: flip u
-            image += vis2dirty(
-                uvw=uvw * (LIGHT / channel.freq_hz),
-                freq=np.array([channel.freq_hz]),
-                vis=np.ascontiguousarray(values)[:, None],
-                wgt=np.ascontiguousarray(weights[k])[:, None],
-                npix_x=self.imager.pixels,
-                npix_y=self.imager.pixels,
-                pixsize_x=self.imager.pixel,
-                pixsize_y=self.imager.pixel,
-                # half of it: ducc0's is an rms, and the largest error, at the edge, was up to 1.5 times that asked for.
-                # One visibility is then wrong by 0.52 times the accuracy at most, and errors add up at worst
-                epsilon=max(self.imager.accuracy / 2, 1e-12),
-                do_wgridding=True,
-                divide_by_n=False,
-                flip_u=True,
-                flip_w=True,
-                nthreads=0,
-            ).T
+        uvw, weight, stokes = (np.concatenate(parts) for parts in zip(*found, strict=True))
         channel.weight += weight.sum(axis=0)
-        self.waiting -= channel.count
-        channel.waiting, channel.count = [], 0
+        # half of it: ducc0's is an rms, and the largest error, at the edge, was up to 1.5 times that asked for.
+        # One visibility is then wrong by 0.52 times the accuracy at most, and errors add up at worst
+        columns = [*(weight * stokes).T, *(weight.T[::2] + 0j)]
+        self._sum(channel, uvw, columns, most > 1, self.imager.accuracy / 2)
+
+    def _close(self, channel: _Channel) -> None:
+        """Grid the samples that are held."""
+        if (span := channel.span) is None:
+            return
+        uvw, columns, accuracy = span.gridded()
+        channel.weight += np.repeat(span.weight, 2)
+        channel.span = None
+        if len(uvw):
+            self._sum(channel, uvw, columns, span.apart, accuracy)
+
+    def _sum(self, channel: _Channel, uvw: Float, columns: list[Complex], apart: bool, accuracy: float) -> None:
+        """Re sum_k z_k exp(+2 pi i (u l + v m + w (n-1))) of I, Q, U, V, the PSF and, if `apart`, that of U and V."""
+        images, columns = [*channel.sums[:4]], [*columns]
+        if self.lobes:
+            images.append(channel.sums[4])
+        if self.lobes and (apart or channel.crossed is not None):
+            channel.crossed = images[4].copy() if channel.crossed is None else channel.crossed  # alike until now
+            images.append(channel.crossed)
+        gridder = Gridder(uvw, (self.imager.pixels,) * 2, self.imager.pixel, accuracy, threads=0)
+        for k, image in enumerate(images):
+            values = columns[min(k, len(columns) - 1)]
+            if values.any():  # or a Stokes parameter that is exactly zero
+                image += gridder.image(values)
 
     def finish(self) -> StokesCube:
         """The cube in Jy/beam; a channel without any visibility is NaN; raises when no channel has one."""
@@ -190,6 +270,7 @@ class Images(ImageSums):
         for f, freq in enumerate(freqs):
             channel = self.channels[freq]
             self._grid(channel)
+            self._close(channel)
             with np.errstate(divide="ignore", invalid="ignore"):
                 np.divide(channel.sums[:4], channel.weight[:, None, None], out=planes[f])
                 np.divide(channel.sums[4], channel.weight[0], out=psfs[f])

@@ -12,6 +12,7 @@ from instrument import correlations, mat2
 from instrument.errors import InputError
 from instrument.observe.directions import LIGHT
 from instrument.observe.grid import ImageGrid
+from instrument.predict.gridding import Gridder
 from instrument.predict.operator import ImageOperator
 from instrument.units import Bool, Complex, Float
 from instrument.visibilities import Visibilities, VisibilitySet
@@ -37,31 +38,18 @@ class Degridded(Forward):
 
     def data(self, block: Visibilities, images: Float) -> Complex:
         """sum_p I_p exp(-2 pi i (u l + v m + w (n-1)))."""
-        from ducc0.wgridder.experimental import dirty2vis
-
         stokes = np.zeros((*block.data.shape[:3], 4), complex)
         low, high = self.uv_range or (0.0, np.inf)
         length = np.hypot(block.uvw_m[..., 0], block.uvw_m[..., 1])
         for f, freq in enumerate(block.freq_hz):
             inside = (length >= low * LIGHT / freq * (1 - SAME)) & (length <= high * LIGHT / freq * (1 + SAME))
+            # the error of one visibility, as that of a pixel of `dirty`, whose adjoint this is
+            uvw = block.uvw_m[inside] * (freq / LIGHT)
+            gridder = Gridder(uvw, self.grid.pixels, self.grid.pixel, self.accuracy / 2, threads=0)
             for k, image in enumerate(images[f]):
                 if not (image.any() and inside.any()):
                     continue
-                # signs as in the images of `dirty`, whose adjoint this is
-                found = dirty2vis(
-                    uvw=block.uvw_m[inside],
-                    freq=np.array([freq]),
-                    dirty=np.ascontiguousarray(image.T),
-                    pixsize_x=self.grid.pixel,
-                    pixsize_y=self.grid.pixel,
-                    epsilon=max(self.accuracy / 2, 1e-12),
-                    do_wgridding=True,
-                    divide_by_n=False,
-                    flip_u=True,
-                    flip_w=True,
-                    nthreads=0,
-                )
-                stokes[:, f, :, k][inside] = found[:, 0]
+                stokes[:, f, :, k][inside] = gridder.visibilities(image)
         i, q, u, v = np.moveaxis(stokes, -1, 0)
         return mat2.pack(i + q, u + 1j * v, u - 1j * v, i - q)
 

@@ -25,7 +25,7 @@ from instrument.predict.grid_atom import Atom, about
 from instrument.predict.gridding import FINEST, Gridder
 from instrument.predict.operator import ImageOperator
 from instrument.predict.rounding import known_gain
-from instrument.predict.time_samples import LONGEST_S, TimeSamples, taps_for, time_samples
+from instrument.predict.time_samples import LONGEST_S, TimeSamples, taps_for, time_samples, with_skirts
 from instrument.sky.pixels import PixelSky
 from instrument.units import Complex, Direction, Float, Int, unit_vectors
 from instrument.visibilities import Visibilities
@@ -213,7 +213,7 @@ class GriddedImages(ImageOperator):
         # what polynomials through 8 instants carry turns no faster than that
         beams = 0.06 / (self.instants.step * interval) if len(self.nodes) > 1 else 0.0
         turns = self._rates * float(self.problem.at.freq_hz[channel]) / LIGHT + beams
-        return time_samples(turns, begin, end, interval, self.between)
+        return time_samples(with_skirts(turns, self.between), begin, end, interval, self.between)
 
     def _cuts(self, times: slice, channels: slice) -> Iterator[tuple[slice, int, int, int, int]]:
         """Each atom of some times and channels: its times and channel among them, and in the problem."""

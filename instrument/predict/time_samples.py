@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from instrument.compiled import compiled
+from instrument.observe.directions import EARTH_RATE
 from instrument.phasor import FAST
 from instrument.units import Complex, Float, Int
 
@@ -75,14 +76,39 @@ def time_samples(turns_per_s: Float, begin: Int, end: Int, interval_s: float, to
     tolerance, each integration as it is.
     """
     taps, error = taps_for(tolerance) if tolerance else (2, 0.0)
-    with np.errstate(divide="ignore"):
-        longest = np.minimum(1 / (2 * SIGMA * turns_per_s), LONGEST_S) / interval_s
-    step = STEPS[np.maximum(np.searchsorted(STEPS, longest, side="right") - 1, 0)]
+    step = steps(turns_per_s, interval_s)
     few = (end - 1 - begin) // step + taps < WORTH * (end - begin)
     step = np.where(few & (tolerance > 0), step, 1)
     rows = np.flatnonzero(end > begin)
     sparse = bool(np.any(step[rows] > 1))
     return TimeSamples(taps, error if sparse else 0.0, rows, step[rows], begin[rows], end[rows])
+
+
+def steps(turns_per_s: Float, interval_s: float) -> Int:
+    """Integrations from sample to sample of baselines whose signals turn at most so often, (B,)."""
+    with np.errstate(divide="ignore"):
+        longest = np.minimum(1 / (2 * SIGMA * turns_per_s), LONGEST_S) / interval_s
+    return STEPS[np.maximum(np.searchsorted(STEPS, longest, side="right") - 1, 0)]
+
+
+def with_skirts(turns_per_s: Float, tolerance: float) -> Float:
+    """The band that exp(i x sin(w t)) takes, w the Earth's rotation: its harmonics n have J_n(x), and do not end at x.
+
+    Those above it fall as exp(-0.94 (n - x)^1.5 x^-0.5), and the error of interpolation rises beyond its band as
+    tolerance^(-1.4 (n - x) / x): a band wider by (0.6 log(tolerance) / x)^2 keeps their product below the tolerance,
+    and one that holds all harmonics above it does so too.
+    """
+    if not tolerance:
+        return turns_per_s
+    x, digits = 2 * np.pi * turns_per_s / EARTH_RATE, -np.log(tolerance)
+    with np.errstate(divide="ignore"):
+        more = np.minimum(0.36 * digits**2 / x, 1.1 * digits ** (2 / 3) * np.cbrt(x) + digits / 3)
+    return np.asarray(turns_per_s + EARTH_RATE / (2 * np.pi) * more)
+
+
+def growth(taps: int) -> float:
+    """By how much `gather` may raise the sum of moduli: the largest one of the weights of an integration."""
+    return float(np.abs(kernels(taps)).sum(axis=-1).max())
 
 
 @cache
