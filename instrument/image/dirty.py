@@ -25,18 +25,20 @@ from instrument.units import Complex, Float, Int
 from instrument.visibilities import Visibilities, VisibilitySet
 from instrument.visibility_sets import as_set
 
-HELD = 400_000  # visibilities of a channel gridded at once: more makes a call of 512 pixels 6 % cheaper at most
-ALL_HELD = 5 * HELD  # visibilities that wait in all channels together: bounds memory (192 MB)
+HELD = 400_000  # visibilities or samples of a channel gridded at once: more makes 512 pixels 6 % cheaper at most
+ALL_HELD = 5 * HELD  # visibilities that wait in all channels together, and samples (unless `_few`): 192 and 160 MB
 ALIKE = 1e-3  # of the peak, by which the PSF of U and V may differ from that of I unsaid
-WAITING = 96  # bytes of a visibility that waits: u, v, w, weight, I, Q, U, V
+WAITING = 96  # bytes of a visibility that waits: data, u, v, w, weight
 
 
 @checked
 class Imager(AnyImager):
     """Dirty images of `pixels` x `pixels` of `pixel` each, from baselines within `uv_range` (wavelengths).
 
-    `weighting` "natural", "uniform" or "briggs" (with `robust`). The w-term is always there. `accuracy` is that of the
-    gridding: the error of every pixel is below it times the weighted mean of |V|, which no pixel of an image exceeds.
+    `weighting` "natural", "uniform" or "briggs" (with `robust`). The w-term is always there. `accuracy` is that of
+    the images: the error of every pixel is below it times the weighted mean of |V|, which no pixel of an image exceeds.
+    Where integrations follow each other regularly and UVW are worked out, slow baselines are brought to few samples in
+    time before they are gridded, within the same accuracy; else, or where few are saved, all are gridded as they are.
     Flagged and non-finite visibilities have no weight.
     Where correlations have weights or flags of their own, so have I, Q, U and V (`stokes_weight`); the PSF is then that
     of Stokes I.

@@ -22,6 +22,7 @@ FEW = 48  # integrations up to which visibilities are gridded as they are
 BETWEEN = 0.4  # of the accuracy, for interpolation
 SURE = 1.5  # ducc0's error of one visibility over the one that it is asked for: 1.04 at most was found
 COLUMNS = 10  # real and imaginary parts of I, Q, U, V; weights of I and of U
+SAMPLE = 8.0 * COLUMNS  # bytes
 PAYS = 0.5  # samples in place of as many visibilities, at most
 
 

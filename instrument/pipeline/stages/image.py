@@ -14,6 +14,7 @@ from instrument.errors import InputError, did_you_mean, unused
 from instrument.image.base import AnyImager, ImageSums
 from instrument.image.cube import SolidAngle, StokesCube
 from instrument.image.dirty import ALL_HELD, HELD, WAITING, Imager
+from instrument.image.sparse import SAMPLE
 from instrument.memory import afford
 from instrument.numbers import brief
 from instrument.observe.directions import LIGHT
@@ -105,7 +106,9 @@ def imaging(imager: AnyImager, run: Running, count: int = 1) -> StageWork:
         f"{count_of(count * channels, 'image')} of {imager.pixels} x {imager.pixels} in I, Q, U, V and the PSF",
         seconds=count * seconds,
         held_bytes=weighed * channels * plane
-        + count * (5 * channels * plane + WAITING * min(chosen, HELD * channels, ALL_HELD)),
+        + count * (5 * channels * plane + WAITING * min(run.visibilities, HELD * channels, ALL_HELD))
+        # a channel may hold samples as large as two and a half of its images
+        + count * SAMPLE * min(chosen, HELD * channels, max(ALL_HELD, channels * imager.pixels**2 / 4)),
         block_bytes=GRIDDED * together + 8 * 4 * plane + 128.0 * float(np.prod(run.block)),
         finish_bytes=GRIDDED * together + 8 * 4 * plane,
         result_bytes=count * 5 * channels * plane,
