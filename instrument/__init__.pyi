@@ -41,6 +41,7 @@ from .foreground.loss import signal_loss as signal_loss
 from .foreground.maps import StokesMaps as StokesMaps
 from .foreground.separation import Separation as Separation
 from .image.base import AnyImager as AnyImager
+from .image.beam import BeamImager as BeamImager
 from .image.beam_leakage import leaked_through as leaked_through
 from .image.clean import CleanImager as CleanImager
 from .image.cube import StokesCube as StokesCube

@@ -15,8 +15,10 @@ from instrument.check import BY_STATIONS, DEFINITION, SHARE, Check, Checker, not
 from instrument.checked import checked
 from instrument.errors import InputError, RefusedError
 from instrument.machine import speed
+from instrument.observe.grid import ImageGrid
 from instrument.predict.base import Predictor, Prepared, Problem, Work
 from instrument.predict.direct import Direct
+from instrument.predict.operator import ImageOperator
 from instrument.predict.threads import alone, look_again
 from instrument.shown import short_repr
 from instrument.units import si_prefix
@@ -232,6 +234,16 @@ class Plan(VisibilitySet):
         atoms = dict.fromkeys((t // nt * nt, f // nf * nf) for t, f in checker.chosen())
         cuts = ((slice(t, min(t + nt, times)), slice(f, min(f + nf, channels))) for t, f in atoms)
         return watch(checker, (alone(self.ready.predict, t, f) for t, f in cuts))
+
+    def operator(self, grid: ImageGrid, tolerance: float = 1e-5) -> ImageOperator:
+        """Images of a grid seen by these stations, times and channels through the beams of the scene, and its adjoint.
+
+        What imagers take that correct for beams; gains and other errors of the receivers are no part of it. The grid is
+        about the phase centre unless it has one. Raises `RefusedError` where the tolerance cannot be kept.
+        """
+        from instrument.predict.gridded import image_operator
+
+        return image_operator(self.problem, grid, tolerance)
 
     def _checker(self, samples: int, seed: int) -> Checker:
         against = BY_STATIONS if isinstance(self.engine, Direct) else DEFINITION

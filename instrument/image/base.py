@@ -65,9 +65,15 @@ class AnyImager(Component):
     restores: ClassVar[bool] = False  # whether what it gives is more than the sums of visibilities: a CLEAN, say
     planes_held: ClassVar[float] = 10  # images a channel, while it works, and of what it gives: for the plan of a run
     planes_made: ClassVar[float] = 5
+    through_beams: ClassVar[bool] = False  # whether a run gives it the operator of its beams
     pixels: Annotated[int, Field(ge=16, le=32768)]
     pixel: Annotated[Radians, Field(gt=0)]
     uv_range: tuple[float, float] | None = None
+
+    @property
+    def operator_tolerance(self) -> float:
+        """That of the operator of a run, for imagers that look through beams."""
+        return 1e-5
 
     @field_validator("pixels")
     @classmethod
@@ -156,8 +162,8 @@ class AnyImager(Component):
 class Kept(ImageSums):
     """Blocks kept in a file of their own, for an imager that goes through all of them, or more than once."""
 
-    def __init__(self, imager: AnyImager) -> None:
-        self.imager = imager
+    def __init__(self, imager: AnyImager, operator: ImageOperator | None = None) -> None:
+        self.imager, self.operator = imager, operator
         self.folder = tempfile.TemporaryDirectory(prefix="instrument-")
         self.path = Path(self.folder.name) / "blocks.h5"
         self.writer: StoreWriter | None = None
@@ -179,7 +185,7 @@ class Kept(ImageSums):
                 raise RefusedError("no block of visibilities was given: nothing to image")
             with self._on_disk():
                 self.writer.finish()
-            return self.imager.imaged(VisibilityFile(self.path))
+            return self.imager.imaged(VisibilityFile(self.path), self.operator)
 
     @contextmanager
     def _on_disk(self) -> Iterator[None]:

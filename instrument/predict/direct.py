@@ -10,7 +10,7 @@ import numpy as np
 from instrument import mat2
 from instrument.observe.directions import LIGHT
 from instrument.predict.base import CHUNK, Blockwise, Predictor, Prepared, Problem, Work
-from instrument.predict.operator import ImageOperator
+from instrument.predict.operator import STOKES, ImageOperator
 from instrument.sky.image import ImageSky
 from instrument.units import Complex, Float, Int
 
@@ -57,7 +57,14 @@ class DirectImages(ImageOperator):
         """A x, complex (T, F, B, 2, 2)."""
         return self.engine.sums(self._of(images, times, channels, pairs))
 
-    def adjoint(self, data: Complex, times: slice, channels: slice, pairs: tuple[Int, Int] | None = None) -> Float:
+    def adjoint(
+        self,
+        data: Complex,
+        times: slice,
+        channels: slice,
+        pairs: tuple[Int, Int] | None = None,
+        kinds: tuple[int, ...] = STOKES,
+    ) -> Float:
         """A^H y, real (F, 4, Ny, Nx): Re tr(P_k^H sum_tab J_a^H y_ab J_b conj(K_ab)), P_k the matrix of a Stokes."""
         shape = (len(self.problem.at.freq_hz[channels]), 4, *self.sky.grid.pixels)
         pieces = []
@@ -72,7 +79,9 @@ class DirectImages(ImageOperator):
                 (c[..., 0, 0] + c[..., 1, 1]).real, (c[..., 0, 0] - c[..., 1, 1]).real,
                 (c[..., 0, 1] + c[..., 1, 0]).real, (c[..., 0, 1] - c[..., 1, 0]).imag,
             ], axis=1))  # fmt: skip
-        return np.concatenate(pieces, axis=-1).reshape(shape)
+        out = np.concatenate(pieces, axis=-1).reshape(shape)
+        out[:, [s for s in STOKES if s not in kinds]] = 0.0
+        return out
 
     def _of(self, images: Float, times: slice, channels: slice, pairs: tuple[Int, Int] | None) -> Problem:
         """The problem of a block, for other images."""

@@ -39,14 +39,14 @@ class Atom:
             _forward(planes, there, self._jones(k), *self.listed, out)
         return out
 
-    def adjoint(self, samples: Complex, functions: Float) -> Float:
-        """Images (4, Ny, Nx) of samples (N, 4)."""
+    def adjoint(self, samples: Complex, functions: Float, kinds: tuple[int, ...]) -> Float:
+        """Images (4, Ny, Nx) of samples (N, 4), of some Stokes parameters, 0 in the others."""
         out, planes = np.zeros((4, *self.gridder.pixels)), np.empty((4, len(samples)), complex)
         for k in range(len(functions)):
             _adjoint(samples, self._jones(k), *self.listed, planes)
             if self.shift is not None:
                 planes *= self.shift.conj()
-            for s in range(4):
+            for s in kinds:
                 out[s] += functions[k] * self.gridder.image(planes[s])
         return out
 

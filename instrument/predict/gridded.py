@@ -18,19 +18,22 @@ import numpy as np
 from instrument import mat2
 from instrument.errors import RefusedError
 from instrument.observe.directions import LIGHT, lmn, offset
-from instrument.predict.base import EVERY, Predictor, Prepared, Problem, Work
+from instrument.observe.grid import ImageGrid
+from instrument.predict.base import EVERY, Predictor, Problem, Work
 from instrument.predict.beam_nodes import ONE, BeamNodes, beam_nodes
 from instrument.predict.beam_times import EACH, BeamTimes, beam_times
 from instrument.predict.grid_atom import Atom, about
 from instrument.predict.gridding import FINEST, Gridder
-from instrument.predict.operator import ImageOperator
+from instrument.predict.operator import STOKES, ImageOperator
 from instrument.predict.rounding import known_gain
 from instrument.predict.time_samples import LONGEST_S, TimeSamples, taps_for, time_samples, with_skirts
+from instrument.sky.image import ImageSky
 from instrument.sky.pixels import PixelSky
 from instrument.units import Complex, Direction, Float, Int, unit_vectors
 from instrument.visibilities import Visibilities
 
 LARGEST_ATOM = 2.6e8  # bytes of the visibilities of one channel that are made at once
+KEPT = 2  # atoms
 FEW = 48  # integrations up to which all are worked out as they are
 NODES, TIMES, BETWEEN, GRIDDING = 0.5, 0.1, 0.15, 0.2  # shares of a tolerance
 ROOT2 = 2**0.5  # the norm of the brightness of 1 Jy
@@ -43,7 +46,7 @@ class Gridded(Predictor):
         """Refuses skies that are not images."""
         return None if problem.sky.kind == "image" else "the sky is not an image"
 
-    def prepare(self, problem: Problem, tolerance: float) -> Prepared:
+    def prepare(self, problem: Problem, tolerance: float) -> GriddedImages:
         """Nodes, instants and gridding for a tolerance, each with its share of it."""
         if not tolerance > 0:
             raise RefusedError("it interpolates beams and visibilities: give a tolerance above 0")
@@ -104,7 +107,14 @@ class GriddedImages(ImageOperator):
             out = mat2.sandwich(gains[:, :, block.antenna1], out, gains[:, :, block.antenna2])
         return out if pairs is None else self._picked(out, pairs)
 
-    def adjoint(self, data: Complex, times: slice, channels: slice, pairs: tuple[Int, Int] | None = None) -> Float:
+    def adjoint(
+        self,
+        data: Complex,
+        times: slice,
+        channels: slice,
+        pairs: tuple[Int, Int] | None = None,
+        kinds: tuple[int, ...] = STOKES,
+    ) -> Float:
         """A^H y: images, real (F, 4, Ny, Nx), of visibilities (T, F, B, 2, 2) of whole atoms."""
         block = self.block(times, channels)
         if pairs is not None:
@@ -115,7 +125,7 @@ class GriddedImages(ImageOperator):
         out = np.zeros((block.shape[1], 4, *self.sky.grid.pixels))
         for seen, f, atom in self._atoms(times, channels):
             here = np.ascontiguousarray(data[seen, f]).reshape(-1, block.shape[2], 4)
-            out[f] += atom.adjoint(atom.samples.gather(here), self.functions)
+            out[f] += atom.adjoint(atom.samples.gather(here), self.functions, kinds)
         return out
 
     def predict(self, times: slice, channels: slice) -> Visibilities:
@@ -141,7 +151,7 @@ class GriddedImages(ImageOperator):
         moments = len(self.instants.instants(0, min(nt, self.atom[0])))
         seconds = nodes * kinds * (4e-8 * digits * pixels * atoms + 1.3e-7 * digits * samples)
         seconds += 6e-8 * nodes * samples + 8e-7 * atoms * nodes * moments * stations + 1.5e-7 * nt * nf * baselines
-        held = (64 + 16 * kinds + 100) * samples / max(atoms, 1) + 64.0 * stations * nodes * moments
+        held = (64 + 16 * kinds + 100 * KEPT) * samples / max(atoms, 1) + 64.0 * stations * nodes * moments
         held += 64.0 * stations * min(nt, self.atom[0]) * 2 + 200.0 * pixels + 2 * 64.0 * nt * nf * baselines
         return Work(2e9 * seconds, 8.0 * nodes * pixels, held, seconds)
 
@@ -226,9 +236,25 @@ class GriddedImages(ImageOperator):
     def _atoms(self, times: slice, channels: slice) -> Iterator[tuple[slice, int, Atom]]:
         """Each atom of some times and channels that has samples: its times and its channel among them."""
         for seen, f, *where in self._cuts(times, channels):
-            samples = self._samples(*where)
-            if samples.count:
-                yield seen, f, self._atom(samples, *where)
+            atom = self._kept.get((*where,)) or self._made(*where)
+            if atom is not None:
+                yield seen, f, atom
+
+    @cached_property
+    def _kept(self) -> dict[tuple[int, ...], Atom]:
+        """The latest atoms, for those who ask for the same again."""
+        return {}
+
+    def _made(self, first: int, last: int, channel: int) -> Atom | None:
+        """An atom, kept in the place of the oldest; `None` where it has no samples."""
+        samples = self._samples(first, last, channel)
+        if not samples.count:
+            return None
+        atom = self._atom(samples, first, last, channel)
+        while len(self._kept) >= KEPT and (oldest := next(iter(self._kept), None)) is not None:
+            self._kept.pop(oldest, None)
+        self._kept[first, last, channel] = atom
+        return atom
 
     def _atom(self, samples: TimeSamples, first: int, last: int, channel: int) -> Atom:
         at, freq, interval = self.problem.at, float(self.problem.at.freq_hz[channel]), self.problem.interval_s
@@ -295,6 +321,13 @@ def _atom(problem: Problem) -> int:
     """Integrations of one channel that are made together."""
     times, _, baselines = problem.shape
     return max(1, min(times, max(FEW, int(LARGEST_ATOM / (64 * baselines)))))
+
+
+def image_operator(problem: Problem, grid: ImageGrid, tolerance: float) -> GriddedImages:
+    """The operator of images of a grid through the beams of a problem, whatever its sky is and its gains."""
+    sky = ImageSky(grid=grid, stokes=np.ones((1, 4, *grid.pixels))).about(problem.at.centre)
+    beams = replace(problem, sky=sky, at=problem.at.towards(*sky.outline()), chain=problem.chain.beams())
+    return Gridded().prepare(beams, tolerance)
 
 
 def _towards(problem: Problem, sky: PixelSky, nodes: BeamNodes) -> Any:

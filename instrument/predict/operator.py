@@ -8,6 +8,8 @@ from instrument.predict.base import Prepared
 from instrument.sky.pixels import PixelSky
 from instrument.units import Complex, Float, Int
 
+STOKES = (0, 1, 2, 3)  # I, Q, U, V
+
 
 class ImageOperator(Prepared):
     """The linear map A of images x, real (F, 4, Ny, Nx), to visibilities (T, F, B, 2, 2), and its exact adjoint.
@@ -28,10 +30,18 @@ class ImageOperator(Prepared):
         """A x: visibilities in Jy, complex (T, F, B, 2, 2), of images (F, 4, Ny, Nx) of these channels in Jy/pixel."""
 
     @abstractmethod
-    def adjoint(self, data: Complex, times: slice, channels: slice, pairs: tuple[Int, Int] | None = None) -> Float:
+    def adjoint(
+        self,
+        data: Complex,
+        times: slice,
+        channels: slice,
+        pairs: tuple[Int, Int] | None = None,
+        kinds: tuple[int, ...] = STOKES,
+    ) -> Float:
         """A^H y: images, real (F, 4, Ny, Nx), of visibilities (T, F, B, 2, 2) of whole atoms; those of blocks add up.
 
-        No weights and no normalisation: multiply the data by weights, divide by what the sum of them needs.
+        Of some `kinds` of Stokes parameters only, 0 in the others, where that is less work. No weights and no
+        normalisation: multiply the data by weights, divide by what the sum of them needs.
         """
 
     def sums(self, times: slice, channels: slice, pairs: tuple[Int, Int] | None = None) -> Complex:

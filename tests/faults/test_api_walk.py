@@ -283,6 +283,9 @@ def calls():
         ins.DirectionalCal(),
         ins.IncompleteModel(models=(1,)),
         ins.Imager(pixels=16, pixel="1 arcmin"),
+        ins.CleanImager(pixels=16, pixel="1 arcmin"),
+        ins.BeamImager(pixels=16, pixel="1 arcmin"),
+        ins.SourceFinder(),
         ins.GainTerm(),
     ]
     things += [ins.FeedTerm(), ins.CubeAnalysis(), station, ins.load("skies", "grid"), w.remover]

@@ -11,7 +11,7 @@ import numpy as np
 
 from instrument.component import KIND, Component
 from instrument.errors import InputError, did_you_mean, unused
-from instrument.image.base import AnyImager, ImageSums
+from instrument.image.base import AnyImager, ImageSums, Kept
 from instrument.image.cube import SolidAngle, StokesCube
 from instrument.image.dirty import ALL_HELD, HELD, WAITING, Imager
 from instrument.image.sparse import SAMPLE
@@ -79,6 +79,9 @@ class Image(Stage):
 
     def sums(self, run: Running) -> ImageSums:
         """Empty sums of images, with the weights of this run."""
+        if self.imager.through_beams:
+            grid = self.imager.grid(run.plan.problem.at.centre)
+            return Kept(self.imager, run.plan.operator(grid, self.imager.operator_tolerance))
         return self.imager.start(run.density(self.imager))
 
 

@@ -1,0 +1,190 @@
+"""BeamImager: images through the beams of an operator (A-projection), corrected for what they leak."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from instrument import mat2
+from instrument.checked import checked
+from instrument.errors import InputError
+from instrument.image.base import AnyImager, Imaged, Kept
+from instrument.image.beam_solve import Channel, Corrected, joint, normalised, predicted
+from instrument.image.beam_weights import mueller_weights
+from instrument.image.cube import StokesCube
+from instrument.image.psf import fit_psf
+from instrument.jones.chain import Chain
+from instrument.jones.towards import Towards
+from instrument.numbers import TOLERANCE
+from instrument.observe.directions import LIGHT
+from instrument.observe.grid import ImageGrid
+from instrument.predict.base import EVERY, Problem
+from instrument.predict.gridded import image_operator
+from instrument.predict.operator import ImageOperator
+from instrument.sky.points import PointSky
+from instrument.units import ArrayOf
+from instrument.visibilities import Visibilities, VisibilitySet
+from instrument.visibility_sets import VisibilityFile, as_set
+
+SAME = 1e-9  # of a frequency or a time, by which data and an operator may differ
+
+
+@checked
+class BeamImager(AnyImager):
+    """Images of the sky before the beams, (F, 4, N, N) in Jy/beam, of visibilities as they were seen through them.
+
+    Every visibility is taken back through the beams of its stations at its time (A^H w V, with all four Stokes
+    parameters of each), and every pixel through the inverse of sum w M^H M, the 4 x 4 Mueller matrices that it was seen
+    with. Three ways, by what they remove of the leakage:
+
+    - "normalised": that alone. The leakage of a source is gone but for what the sidelobes of others bring, 84 to 92 %
+      of it with LOFAR; nothing is gained on a diffuse sky, whose leakage changes as the PSF does.
+    - "joint": I, Q, U, V of the pixels of `mask` (N, N) are solved together by conjugate gradients on the operator; the
+      images are what is left, normalised, and the components in it. For sources at known places; CLEAN finds them.
+    - "predict": Q and U are solved alone, from the Q and U of the visibilities, and what they leak into I and V is
+      predicted and taken out. For diffuse polarized skies where I is faint.
+
+    The solutions take at most `iterations`, and end when the visibilities are met to the tolerance of the operator.
+    Pixels where the noise of a Stokes parameter is more than `amplification` times that of the best pixel have no data.
+    `tolerance` is that of an operator that a run makes; `image` takes one (`plan.operator`), or sees no beams.
+    """
+
+    through_beams: ClassVar[bool] = True
+    planes_held: ClassVar[float] = 80  # of one channel: its matrices, the functions of the nodes, the solution
+    way: Literal["normalised", "joint", "predict"] = "normalised"
+    iterations: Annotated[int, Field(ge=1, le=1000)] = 16
+    amplification: Annotated[float, Field(gt=1)] = 10.0
+    tolerance: Annotated[float, TOLERANCE] = 1e-5
+    mask: Annotated[Any, ArrayOf(bool, (None, None))] | None = None
+
+    def image(
+        self, visibilities: VisibilitySet | Iterable[Visibilities], operator: ImageOperator | None = None
+    ) -> StokesCube:
+        """Images of the sky before the beams; see `imaged`."""
+        return self.imaged(visibilities, operator).cube
+
+    def imaged(
+        self, visibilities: VisibilitySet | Iterable[Visibilities], operator: ImageOperator | None = None
+    ) -> Imaged:
+        """The same with the "model" (Jy/pixel) beside them, and how each channel ended under "beam".
+
+        The beam towards the phase centre is taken out of the visibilities first, unless it has been; with another taken
+        out, or not those of the operator, they are refused (`InputError`).
+        """
+        given = as_set(visibilities)
+        if not isinstance(given, Visibilities | VisibilityFile):
+            kept = Kept(self, operator)
+            for block in given.blocks():
+                kept.add(block)
+            return kept.everything()
+        done = [self._channel(_channel_of(given, f), operator) for f in range(len(given.freq_hz))]
+        first = _channel_of(given, 0)
+        cube = self._cube(first, given, np.stack([found.images for found, _ in done]), "Jy/beam")
+        psfs = np.stack([psf for _, psf in done])
+        cube = cube.with_psf(fit_psf(psfs, self.pixel))
+        beside = {}
+        if self.way != "normalised":
+            beside["model"] = self._cube(first, given, np.stack([found.model for found, _ in done]), "Jy/pixel")
+        return Imaged(cube, beside, {"beam": [found.record for found, _ in done]})
+
+    @property
+    def operator_tolerance(self) -> float:
+        """As it was asked for."""
+        return self.tolerance
+
+    def error(self) -> str:
+        """That of the operator."""
+        return f"operator {self.tolerance:.0e} of |V|"
+
+    def _cube(self, first: Visibilities, given: Any, data: Any, unit: Any) -> StokesCube:
+        from astropy import units as u
+
+        return StokesCube(
+            data=data, frequencies=given.freq_hz * u.Hz, pixel=self.pixel * u.rad, unit=unit, centre=first.phase_centre,
+            constants="data",
+        )  # fmt: skip
+
+    def _channel(self, block: Visibilities, operator: ImageOperator | None) -> tuple[Corrected, Any]:
+        """The images of one channel, and its PSF (N, N)."""
+        grid = self.grid(block.phase_centre)
+        operator = operator or self._plain(block, grid)
+        if operator.sky.grid.pixels != grid.pixels or abs(operator.sky.grid.pixel / grid.pixel - 1) > SAME:
+            raise InputError(
+                f"the operator is of images of {operator.sky.grid}, the imager of {grid}: give both the same"
+            )
+        block, centre = _without_centre(block, operator.problem.chain)
+        weight = block.whole_weight * np.ones(block.data.shape[:3])
+        weight = weight * _within(block, self.uv_range)
+        channel = _place(block, operator)
+        problem = operator.problem.block(EVERY, channel).between(block.antenna1, block.antenna2)
+        weights = mueller_weights(problem, grid, weight[:, 0], self.amplification, centre)
+        seen = Channel(operator, channel, (block.antenna1, block.antenna2), block.data, weight, weights, centre)
+        if self.way == "joint":
+            if self.mask is None or self.mask.shape != grid.pixels:
+                raise InputError(f"way = 'joint' needs mask, true where sources are, bool {grid.pixels}")
+            found = joint(seen, self.mask, self.iterations, self.tolerance)
+        elif self.way == "predict":
+            found = predicted(seen, self.iterations, self.tolerance)
+        else:
+            found = normalised(seen)
+        found.record["condition"] = float(np.max(weights.condition[weights.usable]))
+        found.record["without_data"] = float(np.mean(~weights.usable))
+        return found, self._psf(seen)
+
+    def _psf(self, seen: Channel) -> Any:
+        """What a point of 1 Jy in I at the centre becomes in I, without any correction but for its own matrix."""
+        point = np.zeros((4, self.pixels, self.pixels))
+        middle = self.pixels // 2
+        point[0, middle, middle] = 1.0
+        image = seen.back(seen.seen(point), (0,))[0]
+        return image / image[middle, middle]
+
+    def _plain(self, block: Visibilities, grid: ImageGrid) -> ImageOperator:
+        """An operator without beams, for data of which none are known."""
+        a, b = block.antenna1, block.antenna2
+        sky = PointSky.at(block.phase_centre.skycoord, [[1.0, 0.0, 0.0, 0.0]])
+        return image_operator(Problem(block.at, Chain(), sky, a, b, block.integration_s), grid, self.tolerance)
+
+
+def _channel_of(given: Visibilities | VisibilityFile, channel: int) -> Visibilities:
+    """One channel of a set, all its times."""
+    one = slice(channel, channel + 1)
+    return given.block(EVERY, one) if isinstance(given, Visibilities) else Visibilities.of(given.store, EVERY, one)
+
+
+def _without_centre(block: Visibilities, beams: Chain) -> tuple[Visibilities, Any]:
+    """Visibilities without the beam towards their phase centre, and what took it out (T, 1, A, 2, 2)."""
+    if not beams.terms:
+        return block, None
+    state = block.beam_state
+    if state.removed == "centre" and (state.other or state.towards != block.phase_centre):
+        raise InputError(f"these visibilities have had a beam taken out that is not that of the operator: {state}")
+    taken = Towards(chain=beams)
+    inverse = mat2.inverse(taken.jones(block.at)[:, :, :, 0])
+    inverse = np.where(np.isfinite(inverse).all(axis=(-2, -1), keepdims=True), inverse, 0.0)
+    inverse = np.broadcast_to(inverse, (*block.at.shape[:3], 2, 2))
+    return (block if state.removed == "centre" else block.corrected(taken)), inverse
+
+
+def _within(block: Visibilities, uv_range: tuple[float, float] | None) -> Any:
+    """Where the visibilities of one channel are within a uv range, (T, 1, B)."""
+    low, high = uv_range or (0.0, np.inf)
+    length = np.hypot(block.uvw_m[..., 0], block.uvw_m[..., 1]) * (block.freq_hz[0] / LIGHT)
+    return ((length >= low) & (length <= high))[:, None]
+
+
+def _place(block: Visibilities, operator: ImageOperator) -> slice:
+    """Which channel of an operator a channel is; raises `InputError` where times, stations or channel are others."""
+    at = operator.problem.at
+    if block.layout.names != at.layout.names:
+        raise InputError("the operator is of other stations than the visibilities, or in another order")
+    f = int(np.argmin(np.abs(at.freq_hz - block.freq_hz[0])))
+    same = len(at.slots_s) == len(block.at.slots_s) and np.all(np.abs(at.slots_s - block.at.slots_s) <= 1e-3)
+    if not same or abs(at.freq_hz[f] / block.freq_hz[0] - 1) > SAME:
+        raise InputError(
+            "the operator has not the times and channels of the visibilities: prepare it for the same scene"
+        )
+    return slice(f, f + 1)
