@@ -129,5 +129,7 @@ def predicted(seen: Channel, iterations: int, least: float) -> Corrected:
         rr, before = float(np.vdot(r, r)), rr
         p = r + rr / before * p
         done += 1
-    images = seen.weights.undone(seen.back(left - linear(left) + wanted))
+    # apart: taken back together, Q and U would leak into I by their sidelobes, as without any solution
+    images = seen.weights.undone(seen.back(left))
+    images[list(Q_AND_U)] = seen.weights.undone(seen.back(seen.data))[list(Q_AND_U)]
     return Corrected(images, model, {"iterations": done, "left_of_linear": share})
