@@ -77,6 +77,11 @@ class World:
         self.jansky = ins.Imager(pixels=32, pixel=8 * u.arcmin).image(self.vis)
         self.signal = ins.Signal21cm.table()
         self.analyzer = ins.Analyzer(self.cube)
+        one = np.ones(1)
+        self.found = ins.SourceCatalogue(
+            one, one, one, np.ones((1, 1, 4)), np.ones((1, 1, 4)), one, one, one, one, one, np.zeros(1, int),
+            np.ones(1, bool), 150e6 * one,
+        )  # fmt: skip
         self.faraday = self.analyzer.rm_synthesis(np.arange(-50, 51, 5.0))
         self.cylinders = self.analyzer.cylindrical()
         self.window = self.analyzer.eor_window(self.signal)
@@ -196,6 +201,8 @@ def calls():
             "stokes": "I", "planes": {"I": w.cube.data[:, 0]}, "freq_hz": w.cube.freq_hz, "pixel_rad": 1e-3,
             "unit": "K", "psf": None}),
         ("Imager.image", ins.Imager(pixels=16, pixel=8 * u.arcmin).image, {"visibilities": w.vis}),
+        ("SourceCatalogue.sky", w.found.sky, {"channel": 0}),
+        ("SourceCatalogue.against", w.found.against, {"reference": w.sky, "within": 1 * u.arcmin, "least": 1 * u.Jy}),
         ("Imager.psf", ins.Imager(pixels=16, pixel=8 * u.arcmin).psf, {"visibilities": w.vis}),
         ("StokesCube", ins.StokesCube, {
             "data": np.zeros((2, 4, 3, 3)), "frequencies": [150, 151] * u.MHz, "pixel": 1 * u.arcmin, "unit": "K",
