@@ -55,6 +55,7 @@ from .jones.base import ElementBeam as ElementBeam
 from .jones.base import JonesTerm as JonesTerm
 from .jones.base import ScalarTerm as ScalarTerm
 from .jones.base import Simplified as Simplified
+from .jones.beam_error import BeamError as BeamError
 from .jones.chain import Chain as Chain
 from .jones.feed import FeedTerm as FeedTerm
 from .jones.gain import GainTerm as GainTerm

@@ -56,7 +56,7 @@ def _whole(chain: Callable[[Any], Chain]) -> Callable[[Any], Chain]:
             if _place(found, term, self) is None:
                 alike = (_place(found, t, self) for t in others[:k] if t.maps == term.maps)
                 begin = [1 + n for n in alike if n is not None]
-                found = found.with_term(term, max([len(found.gains().terms), *begin]))
+                found = term.enter(found, max([len(found.gains().terms), *begin]))
         return found
 
     return whole

@@ -74,6 +74,14 @@ class JonesTerm(Component):
         """What a chain multiplies for the term: itself, but for elements, which have a sign of time of their own."""
         return self
 
+    def enter(self, chain: Any, begin: int = 0) -> Any:
+        """A chain with this term: at the leftmost place from `begin` on where its bases fit."""
+        return chain.with_term(self, begin)
+
+    def known(self) -> tuple[JonesTerm, ...]:
+        """What those who correct for the term put in its place: itself, unless it is wrong in a way nobody knows."""
+        return (self,)
+
     def phasors(self) -> int:
         """How many sines and cosines it takes for each time, channel and direction: what an engine plans with."""
         return 0

@@ -111,6 +111,10 @@ class Chain(Component):
         """The terms that differ between directions: the chain without its direction-independent left end."""
         return Chain(*self.terms[self._first_beam() :])
 
+    def known(self) -> Chain:
+        """The chain as those who correct for it know it: beams without the errors that were drawn for them."""
+        return Chain(*(k for t in self.terms for k in t.known()))
+
     def _first_beam(self) -> int:
         return next((i for i, t in enumerate(self.terms) if any(p.directional for p in t.parts())), len(self.terms))
 
