@@ -40,6 +40,8 @@ class BeamState:
         if self.beams is not None and taken.terms and not self.beams.terms:
             raise BeamStateError("there is no beam in these visibilities (beam=None): there is none to take out")
         other = self.beams is not None and taken != self.beams
+        if other and self.beams is not None and beam.direction in (None, centre):
+            other = taken.known() != self.beams.known()  # towards where it points a beam has no error
         if other:
             warn("the beam that is taken out is not the beam that is in the data: their ratio is left at the centre")
         return BeamState("centre", beam.direction or centre, self.beams, other)

@@ -238,8 +238,9 @@ class Plan(VisibilitySet):
     def operator(self, grid: ImageGrid, tolerance: float = 1e-5) -> ImageOperator:
         """Images of a grid seen by these stations, times and channels through the beams of the scene, and its adjoint.
 
-        What imagers take that correct for beams; gains and other errors of the receivers are no part of it. The grid is
-        about the phase centre unless it has one. Raises `RefusedError` where the tolerance cannot be kept.
+        What imagers take that correct for beams; gains and other errors of the receivers are no part of it, nor is a
+        `BeamError`. The grid is about the phase centre unless it has one. Raises `RefusedError` where the tolerance
+        cannot be kept.
         """
         from instrument.predict.gridded import image_operator
 

@@ -292,7 +292,12 @@ class Visibilities(VisibilitySet):
         if instrument.layout().names != self.layout.names:
             raise InputError("these visibilities are of other stations than the instrument, or in another order")
         beams, there = instrument.chain().beams(), self.beam_state.beams
-        if there is not None and there.terms and self.beam_state.removed == "nothing" and there != beams:
+        if (
+            there is not None
+            and there.terms
+            and self.beam_state.removed == "nothing"
+            and there.known() != beams.known()
+        ):
             raise BeamStateError(
                 "the beam of this instrument is not the beam in the data: another element, pointing or phase; to "
                 "take it out on purpose: corrected(Towards(chain=...))"

@@ -324,9 +324,9 @@ def _atom(problem: Problem) -> int:
 
 
 def image_operator(problem: Problem, grid: ImageGrid, tolerance: float) -> GriddedImages:
-    """The operator of images of a grid through the beams of a problem, whatever its sky is and its gains."""
+    """The operator of images of a grid through the beams of a problem as they are known, whatever its sky and gains."""
     sky = ImageSky(grid=grid, stokes=np.ones((1, 4, *grid.pixels))).about(problem.at.centre)
-    beams = replace(problem, sky=sky, at=problem.at.towards(*sky.outline()), chain=problem.chain.beams())
+    beams = replace(problem, sky=sky, at=problem.at.towards(*sky.outline()), chain=problem.chain.beams().known())
     return Gridded().prepare(beams, tolerance)
 
 

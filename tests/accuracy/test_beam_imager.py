@@ -112,3 +112,23 @@ def test_what_cannot_be_undone_is_masked_or_refused():
         imager.with_fields(pixels=32).image(vis, operator)
     with pytest.raises(InputError, match="not the times and channels"):
         imager.image(vis.block(slice(0, 2), slice(0, 1)), operator)
+
+
+def test_a_wrong_beam_leaves_leakage_in_proportion():
+    """The operator knows the beam without its error: nothing is left without one, 10 times as much of 10 times it."""
+    sky, mask = sources()
+    imager = BeamImager(
+        way="joint", pixels=24, pixel=8 * u.arcmin, uv_range=UV, mask=mask, tolerance=1e-7, iterations=20
+    )
+    plans = {
+        rms: plan_of(sky, stations=SOME[:6], interval=2 * u.hour, terms=[instrument.BeamError(rms=rms, seed=1)])
+        for rms in (0.1, 0.01, 0.0)
+    }
+    operator = plans[0.1].operator(ImageGrid(pixels=24, pixel=8 * u.arcmin), 1e-5)
+    left = {}
+    for rms, plan in plans.items():
+        planes = imager.imaged(plan.run(), operator).beside["model"].data[0]
+        left[rms] = np.sqrt((polarized(planes[:, mask]) ** 2).mean())
+    assert left[0.1] > 3e-5
+    assert left[0.0] < 1e-6
+    assert left[0.1] == pytest.approx(10 * left[0.01], rel=0.01)

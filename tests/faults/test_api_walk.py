@@ -145,6 +145,8 @@ def calls():
         ("ImageSky.planes", w.pixels.planes, {"freq_hz": np.array([1.5e8])}),
         ("ImageSky.total_jy", w.pixels.total_jy, {"freq_hz": np.array([1.5e8])}),
         ("GainTerm.jones", w.terms.terms[0].jones, {"at": w.at}),
+        ("BeamError.jones", ins.BeamError(rms=0.1).jones, {"at": w.at}),
+        ("BeamError.simplify", ins.BeamError(rms=0.1).simplify, {"at": w.at, "tolerance": 0.0}),
         ("GainTerm.simplify", w.terms.terms[0].simplify, {"at": w.at, "tolerance": 0.0}),
         ("GainTerm.peak", w.terms.terms[0].peak, {"at": w.at}),
         ("GainTerm.sharing", w.terms.terms[0].sharing, {"at": w.at}),
