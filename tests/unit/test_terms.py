@@ -214,6 +214,15 @@ def test_a_term_that_draws_has_a_seed_of_its_label():
     assert drawn("instrument.terms.b={kind='gain', rms=0.1, seed=3}")[0].seed == 3
 
 
+def test_a_scene_may_have_a_wrong_beam():
+    found = parse(small("instrument.terms.bad={kind='beam-error', rms=0.1, common=true}")).telescope()
+    error = found.chain().terms[-1]
+    assert names(found.chain())[-1] == "BeamError"
+    assert (error.rms, error.common) == (0.1, True)
+    assert error.seed != 0
+    assert error.beam == found.with_fields(terms=()).chain().beams()
+
+
 @pytest.mark.parametrize(
     ("setting", "line"),
     [
