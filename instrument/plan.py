@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -208,7 +208,14 @@ class Plan(VisibilitySet):
 
     def watched(self, samples: int = 64, seed: int = 0) -> Plan:
         """The same plan, whose blocks are checked as they pass by; `check` says what was found."""
-        return replace(self, checker=self._checker(samples, seed))
+        return self.changed(checker=self._checker(samples, seed))
+
+    def changed(self, **fields: Any) -> Plan:
+        """The same with other lines, or another checker: the engine stays ready as it is."""
+        found = replace(self, **fields)
+        if "ready" in vars(self):
+            vars(found)["ready"] = self.ready
+        return found
 
     @property
     def check(self) -> Check:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -143,7 +142,7 @@ class SceneFile(Component):
             kept.append(Item("stages", ", ".join(self.running) + (", in this order" if len(self.running) > 1 else "")))
         if absent:
             left_out.append(Item("other stages", f"not in the scene: {', '.join(absent)}"))
-        return replace(found, kept=tuple(kept), left_out=tuple(left_out))
+        return found.changed(kept=tuple(kept), left_out=tuple(left_out))
 
     def _say_unused(self) -> None:
         """Name tables and keys that nothing will take."""

@@ -15,7 +15,7 @@ from instrument.units import Complex, Float, Int
 
 POINTS = 8  # instants that each value is made of
 STEPS_S = (1800.0, 1200.0, 900.0, 600.0, 400.0, 300.0, 200.0, 150.0, 100.0, 60.0, 40.0)
-LOOKED = 12  # windows of instants in which a step is tried
+LOOKED, NODES = 8, 12  # windows of instants in which a step is tried, towards so many nodes at most
 SAFETY = 2.0
 
 
@@ -51,6 +51,8 @@ def beam_times(beams: Chain, at: Sampling, interval_s: float, span: tuple[int, i
     """
     highest = int(np.argmax(at.freq_hz))
     one = at.block(slice(None), slice(highest, highest + 1))
+    few = np.unique(np.linspace(0, at.shape[3] - 1, NODES).astype(int))
+    one = one.towards(one.ra_rad[few], one.dec_rad[few])
     for seconds in STEPS_S:
         step = int(seconds / interval_s)
         if step < 2 or step * POINTS > span[1] - span[0]:
