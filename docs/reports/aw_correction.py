@@ -145,7 +145,7 @@ def exact():
         seconds = time.perf_counter() - t0
         name = f"joint, operator {tolerance:.0e}, {made.record['beam'][0]['iterations']} iterations"
         removed(f"{name}, components", model, before, where, seconds)
-        removed(f"{name}, components and residual image", model + made.cube.data[0][:, y, x].T, before, where)
+        removed(f"{name}, restored image", made.cube.data[0][:, y, x].T, before, where)
 
 
 def joint_places(plan):

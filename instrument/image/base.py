@@ -22,6 +22,7 @@ from instrument.image.weights import Density
 from instrument.observe.directions import LIGHT
 from instrument.observe.grid import ImageGrid
 from instrument.predict.operator import ImageOperator
+from instrument.sky.base import PlacedSky
 from instrument.store import StoreWriter
 from instrument.units import Direction, Float, Radians
 from instrument.visibilities import Visibilities, VisibilitySet
@@ -140,6 +141,10 @@ class AnyImager(Component):
         if found is None:
             raise RefusedError(f"{type(self).__name__} gives no PSF")
         return found
+
+    def for_sky(self, sky: PlacedSky, centre: Direction) -> Self:
+        """What a run takes in its place, for one that can use what the run knows of its sky: itself."""
+        return self
 
     def density(self, visibilities: VisibilitySet) -> dict[float, Density] | None:
         """What weights need to know of all visibilities before the first is added; `None`: nothing."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
@@ -15,17 +15,19 @@ from instrument.image.base import AnyImager, Imaged, Kept
 from instrument.image.beam_solve import Channel, Corrected, joint, normalised, predicted
 from instrument.image.beam_weights import mueller_weights
 from instrument.image.cube import StokesCube
-from instrument.image.psf import fit_psf
+from instrument.image.minor import Folding, restored
+from instrument.image.psf import Psf, fit_psf
 from instrument.jones.chain import Chain
 from instrument.jones.towards import Towards
 from instrument.numbers import TOLERANCE
-from instrument.observe.directions import LIGHT
+from instrument.observe.directions import LIGHT, lmn
 from instrument.observe.grid import ImageGrid
 from instrument.predict.base import EVERY, Problem
 from instrument.predict.gridded import image_operator
 from instrument.predict.operator import ImageOperator
-from instrument.sky.points import PointSky
-from instrument.units import ArrayOf
+from instrument.sky.base import PlacedSky
+from instrument.sky.points import PointSky, points_of
+from instrument.units import ArrayOf, Direction, Float, unit_vectors
 from instrument.visibilities import Visibilities, VisibilitySet
 from instrument.visibility_sets import VisibilityFile, as_set
 
@@ -71,6 +73,8 @@ class BeamImager(AnyImager):
     ) -> Imaged:
         """The same with the "model" (Jy/pixel) beside them, and how each channel ended under "beam".
 
+        Of the way "joint" the cube is the restored one, and the "residual" stands beside it too.
+
         The beam towards the phase centre is taken out of the visibilities first, unless it has been; with another taken
         out, or not those of the operator, they are refused (`InputError`).
         """
@@ -82,12 +86,15 @@ class BeamImager(AnyImager):
             return kept.everything()
         done = [self._channel(_channel_of(given, f), operator) for f in range(len(given.freq_hz))]
         first = _channel_of(given, 0)
-        cube = self._cube(first, given, np.stack([found.images for found, _ in done]), "Jy/beam")
-        psfs = np.stack([psf for _, psf in done])
-        cube = cube.with_psf(fit_psf(psfs, self.pixel))
+        psf = fit_psf(np.stack([psf for _, psf in done]), self.pixel)
+        images, models = (np.stack([getattr(found, name) for found, _ in done]) for name in ("images", "model"))
         beside = {}
         if self.way != "normalised":
-            beside["model"] = self._cube(first, given, np.stack([found.model for found, _ in done]), "Jy/pixel")
+            beside["model"] = self._cube(first, given, models, "Jy/pixel")
+        if self.way == "joint":
+            beside["residual"] = self._cube(first, given, images, "Jy/beam")
+            images = images + self._restored(models, psf)
+        cube = self._cube(first, given, images, "Jy/beam").with_psf(psf)
         return Imaged(cube, beside, {"beam": [found.record for found, _ in done]})
 
     @property
@@ -98,6 +105,26 @@ class BeamImager(AnyImager):
     def error(self) -> str:
         """That of the operator."""
         return f"operator {self.tolerance:.0e} of |V|"
+
+    def _restored(self, models: Float, psf: Psf) -> Float:
+        """Models folded with the Gaussian of each channel; as points where none could be fitted."""
+        folding, out = Folding(models.shape[2:]), np.array(models)
+        for image, *lobe in zip(out, psf.major_rad, psf.minor_rad, psf.angle_rad, strict=True):
+            if np.isfinite(lobe).all() and min(lobe[:2]) > 0:
+                image[:] = restored(image, (lobe[0], lobe[1], lobe[2]), self.pixel, folding)
+        return out
+
+    def for_sky(self, sky: PlacedSky, centre: Direction) -> Self:
+        """With a mask of the pixels of the sources of a list, where the way needs one and has none."""
+        listed = points_of(sky)
+        if self.way != "joint" or self.mask is not None or listed is None:
+            return self
+        l, m, _ = lmn(unit_vectors(*listed.directions()), centre).T
+        x, y = (np.rint(a / self.pixel).astype(int) + self.pixels // 2 for a in (-l, m))
+        inside = (x >= 0) & (x < self.pixels) & (y >= 0) & (y < self.pixels)
+        mask = np.zeros((self.pixels, self.pixels), bool)
+        mask[y[inside], x[inside]] = True
+        return self.with_fields(mask=mask)
 
     def _cube(self, first: Visibilities, given: Any, data: Any, unit: Any) -> StokesCube:
         from astropy import units as u

@@ -80,8 +80,9 @@ class Image(Stage):
     def sums(self, run: Running) -> ImageSums:
         """Empty sums of images, with the weights of this run."""
         if self.imager.through_beams:
-            grid = self.imager.grid(run.plan.problem.at.centre)
-            return Kept(self.imager, run.plan.operator(grid, self.imager.operator_tolerance))
+            problem = run.plan.problem
+            grid, imager = self.imager.grid(problem.at.centre), self.imager.for_sky(problem.sky, problem.at.centre)
+            return Kept(imager, run.plan.operator(grid, self.imager.operator_tolerance))
         return self.imager.start(run.density(self.imager))
 
 
