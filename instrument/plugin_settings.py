@@ -67,6 +67,8 @@ def _with_unit(value: Any, unit: In) -> str:
     """A default as a scene file would have it; angles in degrees."""
     if unit.array:
         return brief(value)
+    if isinstance(value, tuple):
+        return f"[{', '.join(_with_unit(one, unit) for one in value)}]"
     return f"{math.degrees(value):g} deg" if unit.unit == "rad" else f"{value:g} {unit.unit}"
 
 

@@ -142,6 +142,11 @@ class AnyImager(Component):
             raise RefusedError(f"{type(self).__name__} gives no PSF")
         return found
 
+    @property
+    def operator_passes(self) -> float:
+        """How often visibilities are taken through the operator of a run, there or back: for its plan."""
+        return 0.0
+
     def for_sky(self, sky: PlacedSky, centre: Direction) -> Self:
         """What a run takes in its place, for one that can use what the run knows of its sky: itself."""
         return self

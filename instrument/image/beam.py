@@ -102,6 +102,11 @@ class BeamImager(AnyImager):
         """As it was asked for."""
         return self.tolerance
 
+    @property
+    def operator_passes(self) -> float:
+        """Two for the PSF, and those of the solution, at most."""
+        return 2.0 + {"normalised": 1, "joint": 2 * self.iterations + 2, "predict": self.iterations + 3}[self.way]
+
     def error(self) -> str:
         """That of the operator."""
         return f"operator {self.tolerance:.0e} of |V|"

@@ -67,6 +67,7 @@ SETTINGS: dict[tuple[str, ...], list[dict[str, Any]]] = {
         {"pixels": 64, "pixel": 6 * u.arcmin},
         {"pixels": 64, "pixel": 6 * u.arcmin, "weighting": "briggs", "robust": 0.5, "accuracy": 1e-4},
     ],
+    ("imagers", "beam"): [{"pixels": 32, "pixel": 8 * u.arcmin}],
     ("imagers", "clean"): [{"pixels": 32, "pixel": 8 * u.arcmin, "cycles": 4}],
     ("imagers", "clean", "long"): [{"peaks": "joint"}, {"terms": 1}, {"algorithm": "multiscale", "peaks": "I"}],
     ("stages", "noise"): [{"sefd": 100 * u.Jy, "seed": 1}],

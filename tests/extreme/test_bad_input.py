@@ -77,7 +77,7 @@ CASES = {
     "image={pixels=64,pixel='1 arcmin',uv_range=[800,30]}": ("uv_range",),
     "noise.sefd='-3 Jy'": ("sefd",),
     "tolerance=-1": ("tolerance = -1",),
-    "engine='gpu'": ("gpu", "direct, matrix"),
+    "engine='gpu'": ("gpu", "direct, gridded, matrix"),
     "name='../up'": ("name",),
 }
 

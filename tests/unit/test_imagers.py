@@ -119,7 +119,7 @@ def test_blocks_that_were_kept_are_gone_with_their_file():
     ("settings", "said"),
     [
         (["image.kind='dirti'"], r"\[image\] kind = 'dirti': did you mean 'dirty'"),
-        (["image.kind=3"], r"\[image\] kind = 3: known: clean, dirty"),
+        (["image.kind=3"], r"\[image\] kind = 3: known: beam, clean, dirty"),
         (["image.pixels=31"], r"\[image\] pixels = 31 must be even"),
     ],
 )
