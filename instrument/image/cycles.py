@@ -103,7 +103,8 @@ class Cycles:
         response = Response.of(self.operator, first.grid, len(model))
         forward: Forward = Degridded(first.grid, imager.accuracy, imager.uv_range)
         if self.operator is not None:
-            forward = Operated(self.operator, first.grid)
+            self.operator.demand(first.grid, imager.uv_range)
+            forward = Operated(self.operator)
         hunts = self._hunts(first, weights, response)
         for _ in range(imager.cycles):
             if not self._minor(hunts, residual, model, response):

@@ -59,21 +59,17 @@ class Operated(Forward):
     """Through an operator, whose times, channels and stations must hold those of the blocks."""
 
     operator: ImageOperator
-    grid: ImageGrid
-
-    def __post_init__(self) -> None:
-        own = self.operator.sky.grid
-        if own.pixels != self.grid.pixels or abs(own.pixel / self.grid.pixel - 1) > SAME:
-            raise InputError(
-                f"the operator is of images of {own} of {own.pixel:.6g} rad, the imager of {self.grid} of "
-                f"{self.grid.pixel:.6g} rad: give both the same"
-            )
 
     def data(self, block: Visibilities, images: Float) -> Complex:
         """A x, of whole atoms of the operator, cut to the block."""
         at = self.operator.problem.at
         if block.layout.names != at.layout.names:
             raise InputError("the operator is of other stations than the visibilities, or in another order")
+        if block.beam_state.removed != "nothing" and self.operator.problem.chain.terms:
+            raise InputError(
+                f"these visibilities have had a beam taken out ({block.beam_state}), which the operator has: give them "
+                "as they were"
+            )
         whole, cuts = [], []
         for axis, (mine, its) in enumerate(((block.at.slots_s, at.slots_s), (block.freq_hz, at.freq_hz))):
             first = int(np.argmin(np.abs(its - mine[0])))

@@ -90,8 +90,8 @@ def beam_nodes(problem: Problem, grid: ImageGrid, tolerance: float) -> BeamNodes
     beams = problem.chain.beams()
     if not any(part.directional for part in beams.parts):
         return ONE
-    half = (grid.pixels[1] / 2 * grid.pixel, grid.pixels[0] / 2 * grid.pixel)  # l and m of a pixel never go beyond
-    some = _some(problem.at)
+    half = _half(grid)
+    some = _some(problem.at, _risen(problem, grid))
     pairs = problem.antenna1, problem.antenna2
     rng = np.random.default_rng(0)
     places = rng.uniform(-1, 1, (PLACES, 2))
@@ -152,9 +152,37 @@ def _rough(grid: ImageGrid, found: float, wanted: float) -> RefusedError:
     )
 
 
-def _some(at: Sampling) -> Sampling:
-    """A few instants and channels of a sampling, the first and the last among them."""
-    times = np.unique(np.linspace(0, at.shape[0] - 1, INSTANTS).round().astype(int))
+def _half(grid: ImageGrid) -> tuple[float, float]:
+    """Half sides of the rectangle about a grid in l and m, which no pixel goes beyond."""
+    return grid.pixels[1] / 2 * grid.pixel, grid.pixels[0] / 2 * grid.pixel
+
+
+def heights(at: Sampling, grid: ImageGrid) -> tuple[Float, Float]:
+    """Sines of the least and the largest elevation of a grid at each time, over all stations, (T,) both."""
+    sides = np.linspace(-1, 1, 17)
+    edge = np.concatenate([np.stack([sides, np.full(17, s)], 1)[:, ::k] for s in (-1, 1) for k in (-1, 1)])
+    zeniths = at.layout.axes[at.layout.frames[0], 2]
+    up = _towards(at, grid, edge * _half(grid)).itrf @ zeniths.T
+    return up.min(axis=(1, 2)), up.max(axis=(1, 2))
+
+
+def _risen(problem: Problem, grid: ImageGrid) -> Int:
+    """The times at which beams are not zero all over a grid, all where none is; raises where a horizon is within it."""
+    every = np.arange(problem.at.shape[0])
+    if not problem.chain.blind_below_horizon:
+        return every
+    low, high = heights(problem.at, grid)
+    if (across := int(((low < 0) & (high > 0)).sum())) > 0:
+        raise RefusedError(
+            f"{grid} rise or set while observed (at {across} of {len(every)} times a horizon goes through them): beams "
+            "are not smooth there; observe while all of them are above it"
+        )
+    return every[high > 0] if (high > 0).any() else every
+
+
+def _some(at: Sampling, among: Int) -> Sampling:
+    """A few instants among some times, and channels, of a sampling, the first and the last among them."""
+    times = among[np.unique(np.linspace(0, len(among) - 1, INSTANTS).round().astype(int))]
     channels = np.unique(np.linspace(0, at.shape[1] - 1, BANDS).round().astype(int))
     ranked = np.argsort(at.freq_hz)[channels]
     return replace(at.some(times), freq_hz=at.freq_hz[np.sort(ranked)])

@@ -15,7 +15,7 @@ from instrument.units import Complex, Float, Int
 
 POINTS = 8  # instants that each value is made of
 STEPS_S = (1800.0, 1200.0, 900.0, 600.0, 400.0, 300.0, 200.0, 150.0, 100.0, 60.0, 40.0)
-LOOKED, NODES = 8, 12  # windows of instants in which a step is tried, towards so many nodes at most
+NODES = 12  # towards which a step is tried, at most
 SAFETY = 2.0
 
 
@@ -57,7 +57,9 @@ def beam_times(beams: Chain, at: Sampling, interval_s: float, span: tuple[int, i
         step = int(seconds / interval_s)
         if step < 2 or step * POINTS > span[1] - span[0]:
             continue
-        first = np.unique(np.linspace(span[0], span[1] - 1 - (POINTS - 1) * step, LOOKED).round().astype(int))
+        # all of the span, and every place of it within the middle of some window
+        count = 2 + 2 * (span[1] - span[0]) // (POINTS * step)
+        first = np.unique(np.linspace(span[0], span[1] - 1 - (POINTS - 1) * step, count).round().astype(int))
         middle = step // 2 + step * (POINTS // 2 - 1)
         offsets = np.append(step * np.arange(POINTS), middle)
         slots = (first[:, None] + offsets).ravel()

@@ -20,11 +20,12 @@ from instrument.errors import RefusedError
 from instrument.observe.directions import LIGHT, lmn, offset
 from instrument.observe.grid import ImageGrid
 from instrument.predict.base import EVERY, Predictor, Problem, Work
-from instrument.predict.beam_nodes import ONE, BeamNodes, beam_nodes
+from instrument.predict.beam_nodes import ONE, BeamNodes, beam_nodes, heights
 from instrument.predict.beam_times import EACH, BeamTimes, beam_times
 from instrument.predict.grid_atom import Atom, about
 from instrument.predict.gridding import FINEST, Gridder
 from instrument.predict.operator import STOKES, ImageOperator
+from instrument.predict.pairs import picked, placed
 from instrument.predict.rounding import known_gain
 from instrument.predict.time_samples import LONGEST_S, TimeSamples, taps_for, time_samples, with_skirts
 from instrument.sky.image import ImageSky
@@ -95,6 +96,10 @@ class GriddedImages(ImageOperator):
     between: float = 0.0  # the error of interpolation between samples, 0 for every integration
     accuracy: float = 1e-6
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What goes to another process: what was decided, and nothing that can be made again there."""
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+
     def forward(self, images: Float, times: slice, channels: slice, pairs: tuple[Int, Int] | None = None) -> Complex:
         """A x: visibilities in Jy, complex (T, F, B, 2, 2); 0 outside the uv range of the problem."""
         block = self.block(times, channels)
@@ -105,7 +110,7 @@ class GriddedImages(ImageOperator):
             out[seen, f] = here.reshape(*here.shape[:2], 2, 2)
         if (gains := self._gains(block)) is not None:
             out = mat2.sandwich(gains[:, :, block.antenna1], out, gains[:, :, block.antenna2])
-        return out if pairs is None else self._picked(out, pairs)
+        return out if pairs is None else picked(self.problem, out, pairs)
 
     def adjoint(
         self,
@@ -118,7 +123,7 @@ class GriddedImages(ImageOperator):
         """A^H y: images, real (F, 4, Ny, Nx), of visibilities (T, F, B, 2, 2) of whole atoms."""
         block = self.block(times, channels)
         if pairs is not None:
-            data = self._placed(data, pairs)
+            data = placed(self.problem, data, pairs)
         if (gains := self._gains(block)) is not None:
             one, other = mat2.herm(gains[:, :, block.antenna1]), mat2.herm(gains[:, :, block.antenna2])
             data = mat2.sandwich(one, data, other)
@@ -251,7 +256,7 @@ class GriddedImages(ImageOperator):
         if not samples.count:
             return None
         atom = self._atom(samples, first, last, channel)
-        while len(self._kept) >= KEPT and (oldest := next(iter(self._kept), None)) is not None:
+        for oldest in list(self._kept)[: 1 - KEPT]:  # a list at once: other threads add theirs
             self._kept.pop(oldest, None)
         self._kept[first, last, channel] = atom
         return atom
@@ -288,34 +293,6 @@ class GriddedImages(ImageOperator):
         found = gains.jones(block.at.at_centre())[:, :, :, 0]
         return np.broadcast_to(found, (*block.at.shape[:3], 2, 2))
 
-    def _rows(self, pairs: tuple[Int, Int]) -> tuple[Int, Any]:
-        """Where pairs of antennas are among the baselines, and which stand the other way round."""
-        known = {
-            p: k for k, p in enumerate(zip(self.problem.antenna1.tolist(), self.problem.antenna2.tolist(), strict=True))
-        }
-        given = list(zip(np.asarray(pairs[0]).tolist(), np.asarray(pairs[1]).tolist(), strict=True))
-        turned = np.array([p not in known for p in given], bool)
-        return np.array([known[p[::-1] if t else p] for p, t in zip(given, turned, strict=True)], int), turned
-
-    def _picked(self, data: Complex, pairs: tuple[Int, Int]) -> Complex:
-        rows, turned = self._rows(pairs)
-        out = data[:, :, rows]
-        out[:, :, turned] = mat2.herm(out[:, :, turned])
-        return out
-
-    def _placed(self, data: Complex, pairs: tuple[Int, Int]) -> Complex:
-        rows, turned = self._rows(pairs)
-        data = np.array(data)
-        data[:, :, turned] = mat2.herm(data[:, :, turned])
-        out = np.zeros((*data.shape[:2], self.problem.shape[2], 2, 2), complex)
-        for k, row in enumerate(rows):  # the same baseline may come twice
-            out[:, :, row] += data[:, :, k]
-        return out
-
-
-def _first(part: slice) -> int:
-    return part.start or 0
-
 
 def _atom(problem: Problem) -> int:
     """Integrations of one channel that are made together."""
@@ -338,5 +315,9 @@ def _towards(problem: Problem, sky: PixelSky, nodes: BeamNodes) -> Any:
 
 def _instants(problem: Problem, sky: PixelSky, nodes: BeamNodes, span: tuple[int, int], share: float) -> BeamTimes:
     """Instants of beams at the nodes for integrations of a span; every one where that will not do."""
+    if problem.chain.blind_below_horizon:
+        low, high = heights(problem.at.every(problem.interval_s, np.arange(*span)), sky.grid)
+        if low.min() < 0 < high.max():  # it rises or sets in the tails of samples, or between integrations
+            return EACH
     wanted = share / (2 * ROOT2 * nodes.growth * max(nodes.peak, 1e-300) ** 0.5)
     return beam_times(problem.chain.beams(), _towards(problem, sky, nodes), problem.interval_s, span, wanted)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from abc import abstractmethod
 
+from instrument.errors import InputError
+from instrument.observe.grid import ImageGrid
 from instrument.predict.base import Prepared
 from instrument.sky.pixels import PixelSky
 from instrument.units import Complex, Float, Int
 
 STOKES = (0, 1, 2, 3)  # I, Q, U, V
+SAME = 1e-9  # by which pixels and ranges may differ
 
 
 class ImageOperator(Prepared):
@@ -24,6 +27,22 @@ class ImageOperator(Prepared):
         sky = self.problem.sky
         assert isinstance(sky, PixelSky)  # or it would have been refused
         return sky
+
+    def demand(self, grid: ImageGrid, uv_range: tuple[float, float] | None) -> None:
+        """Raise `InputError` where an imager has other images, or takes visibilities that the operator leaves at 0."""
+        mine, own = self.sky.grid, self.problem.uv_range
+        if mine.pixels != grid.pixels or abs(mine.pixel / grid.pixel - 1) > SAME:
+            raise InputError(
+                f"the operator is of images of {mine} of {mine.pixel:.6g} rad, the imager of {grid} of "
+                f"{grid.pixel:.6g} rad: give both the same"
+            )
+        low, high = uv_range or (0.0, float("inf"))
+        if own is not None and (low < own[0] * (1 - SAME) or high > own[1] * (1 + SAME)):
+            asked = "all baselines" if uv_range is None else f"uv_range = {list(uv_range)}"
+            raise InputError(
+                f"the operator is of {own[0]:g} to {own[1]:g} wavelengths, and the imager takes {asked}: give it that "
+                "range, or prepare the operator by a plan with the range of the imager"
+            )
 
     @abstractmethod
     def forward(self, images: Float, times: slice, channels: slice, pairs: tuple[Int, Int] | None = None) -> Complex:

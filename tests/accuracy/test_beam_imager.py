@@ -5,7 +5,7 @@ import pytest
 from astropy import units as u
 
 import instrument
-from instrument import BeamImager, ImageGrid, ImageSky, InputError, Observation, Scene
+from instrument import BeamImager, CleanImager, ImageGrid, ImageSky, InputError, Observation, Scene
 from instrument.errors import RefusedError
 from instrument.image.beam_weights import mueller_weights
 from instrument.predict.base import EVERY
@@ -106,7 +106,7 @@ def test_what_cannot_be_undone_is_masked_or_refused():
     strict = imager.with_fields(amplification=1.5).image(vis, operator)
     assert np.isnan(strict.data[0, :, 0, 0]).all()
     assert np.isfinite(strict.data[0, :, 12, 12]).all()
-    with pytest.raises(RefusedError, match="no visibility has a weight above 0"):
+    with pytest.raises(RefusedError, match="has all four correlations with a weight above 0"):
         imager.image(vis.flagged(np.ones(vis.data.shape[:3], bool)), operator)
     with pytest.raises(InputError, match="needs mask"):
         imager.with_fields(way="joint").image(vis, operator)
@@ -134,3 +134,33 @@ def test_a_wrong_beam_leaves_leakage_in_proportion():
     assert left[0.1] > 3e-5
     assert left[0.0] < 1e-6
     assert left[0.1] == pytest.approx(10 * left[0.01], rel=0.01)
+
+
+def test_an_operator_of_fewer_visibilities_than_the_imager_takes_is_refused():
+    """They would be 0 in it, and all of them taken for a sky that the model lacks."""
+    sky, mask = sources()
+    plan = plan_of(sky, stations=SOME[:6], interval=2 * u.hour)
+    vis, operator = plan.run(), plan.operator(ImageGrid(pixels=24, pixel=PIXEL), 1e-4)
+    for imager in (BeamImager(pixels=24, pixel=PIXEL), CleanImager(pixels=24, pixel=PIXEL)):
+        with pytest.raises(InputError, match="the operator is of 20 to 200 wavelengths, and the imager takes all base"):
+            imager.image(vis, operator)
+    corrected = vis.without_beam(lofar_of(plan))
+    with pytest.raises(InputError, match="have had a beam taken out"):
+        CleanImager(pixels=24, pixel=PIXEL, uv_range=UV).image(corrected, operator)
+    with pytest.raises(InputError, match="somewhere within the beam"):
+        BeamImager(pixels=24, pixel=PIXEL, uv_range=UV, way="joint", mask=~mask & mask).image(vis, operator)
+
+
+def test_a_channel_without_visibilities_is_nan_and_the_others_are_not_lost():
+    night = Observation(
+        phase_centre="08h13m36.0s +48d13m03s", transit="2012-12-07", duration=4 * u.hour, interval=2 * u.hour,
+        frequencies=[150, 151] * u.MHz,
+    )  # fmt: skip
+    telescope = instrument.load("telescopes", "lofar-hba", stations=SOME[:6])
+    plan = Scene(instrument=telescope, sky=sources()[0], observation=night).plan()
+    vis, operator = plan.run(), plan.operator(ImageGrid(pixels=24, pixel=PIXEL), 1e-4)
+    flag = np.zeros(vis.data.shape[:3], bool)
+    flag[:, 1] = True
+    found = BeamImager(pixels=24, pixel=PIXEL, way="predict", iterations=2).image(vis.flagged(flag), operator).data
+    assert np.isnan(found[1]).all()
+    assert np.isfinite(found[0]).all()

@@ -6,7 +6,8 @@ from astropy import units as u
 
 import instrument
 from instrument import ImageGrid, Imager, ImageSky, Observation, Scene
-from instrument.errors import RefusedError
+from instrument.check import definition
+from instrument.errors import InputError, RefusedError
 from instrument.jones.mueller import stokes
 from instrument.predict.base import EVERY
 from instrument.predict.direct import Direct
@@ -72,6 +73,12 @@ def test_the_adjoint_is_exact(pixels, uv_range):
         assert off <= 1e-13 * np.linalg.norm(seen) * np.linalg.norm(y)
 
 
+def test_baselines_that_are_not_there_are_refused_in_one_line():
+    ready = Gridded().prepare(problem((6, 4), duration=1 * u.hour).problem, 1e-3)
+    with pytest.raises(InputError, match="has no baseline between CS001HBA0 and CS001HBA0"):
+        ready.forward(np.ones((2, 4, 6, 4)), EVERY, EVERY, (np.array([0]), np.array([0])))
+
+
 def test_what_lies_outside_the_uv_range_is_flagged_and_images_are_the_same():
     whole = problem()
     uvw = whole.problem.visibilities(np.zeros((*whole.problem.shape, 2, 2))).uvw_m
@@ -109,7 +116,7 @@ def test_beams_that_are_not_smooth_are_refused_with_what_can_be_had():
         frequencies=[150] * u.MHz,
     )  # fmt: skip
     scene = Scene(instrument=instrument.load("telescopes", "lofar-hba", stations=NAMES), sky=sky, observation=night)
-    with pytest.raises(RefusedError, match="they are not smooth there"):
+    with pytest.raises(RefusedError, match="beams are not smooth there"):
         scene.plan(tolerance=1e-4, engine="gridded")
     with pytest.raises(RefusedError, match="give a tolerance above 0"):
         scene.plan(engine="gridded")
@@ -136,3 +143,25 @@ def test_a_windowed_sinc_keeps_its_error_and_the_adjoint():
             found.spread(x, out)
             assert np.vdot(y, out).real == pytest.approx(np.vdot(found.gather(y), x).real, rel=1e-12, abs=1e-11)
     assert kernels(8).shape[2] == 8
+
+
+@pytest.mark.parametrize(("dec", "crosses"), [("-20d13m03s", True), ("+20d13m03s", False), ("+30d13m03s", False)])
+def test_an_image_that_rises_or_sets_is_refused_and_one_that_stands_low_is_right(dec, crosses):
+    """A horizon between the instants at which nodes are chosen was not seen: 1e-3 of the flux at a bound of 3e-5."""
+    night = Observation(
+        phase_centre=f"08h13m36.0s {dec}", start="2012-12-07T20:00:00", duration=8 * u.hour, interval=2 * u.min,
+        frequencies=[150] * u.MHz,
+    )  # fmt: skip
+    sky = ImageSky(
+        grid=ImageGrid(pixels=12, pixel=10 * u.arcmin), stokes=np.random.default_rng(0).normal(size=(1, 4, 12, 12))
+    )
+    scene = Scene(instrument=instrument.load("telescopes", "lofar-hba", stations=NAMES), sky=sky, observation=night)
+    plan = scene.plan(tolerance=1e-3, engine="direct")
+    if crosses:
+        with pytest.raises(RefusedError, match=r"12 x 12 pixels rise or set while observed \(at \d+ of 240 times"):
+            Gridded().prepare(plan.problem, 1e-4)
+        return
+    ready = Gridded().prepare(plan.problem, 1e-4)
+    few = np.arange(0, 240, 40)
+    due = np.array([definition(plan.problem.block(slice(t, t + 1), EVERY)) for t in few])
+    assert np.abs(ready.sums(EVERY, EVERY)[few, 0] - due).max() <= ready.bound * plan.scale_jy
