@@ -15,7 +15,7 @@ import numpy as np
 
 from instrument.errors import RefusedError
 from instrument.jones.chain import Chain
-from instrument.observe.directions import offset
+from instrument.observe.directions import lmn, offset
 from instrument.observe.grid import ImageGrid
 from instrument.observe.sampling import Sampling
 from instrument.predict.base import Problem
@@ -91,13 +91,14 @@ def beam_nodes(problem: Problem, grid: ImageGrid, tolerance: float) -> BeamNodes
     if not any(part.directional for part in beams.parts):
         return ONE
     half = _half(grid)
-    some = _some(problem.at, _risen(problem, grid))
+    at_zenith, zenith = _zenith(problem.at, grid)
+    some = _some(problem.at, _risen(problem, grid), at_zenith)
     pairs = problem.antenna1, problem.antenna2
     rng = np.random.default_rng(0)
     places = rng.uniform(-1, 1, (PLACES, 2))
     on_edge, side = np.arange(PLACES // 2), rng.integers(2, size=PLACES // 2)
     places[on_edge, side] = np.sign(places[on_edge, side]) * (1 - 1e-9)
-    places *= half
+    places = np.concatenate([places * half, zenith])
     due = _products(beams, _towards(some, grid, places), pairs, seed=2)
     peak = float(np.linalg.norm(due, axis=1).max()) / 2  # |M| = 2 for the identity, whose largest singular value is 1
     wanted = tolerance * min(1.0, peak)
@@ -148,7 +149,7 @@ def _smooth(
 def _rough(grid: ImageGrid, found: float, wanted: float) -> RefusedError:
     return RefusedError(
         f"beams are carried over {grid} to {found:.1e} of their peak, not to {wanted:.1e}: they are not smooth there "
-        "(a horizon, a term drawn for each direction), or the field is too wide"
+        "(a zenith or a celestial pole among them, a term drawn for each direction), or the field is too wide"
     )
 
 
@@ -180,9 +181,25 @@ def _risen(problem: Problem, grid: ImageGrid) -> Int:
     return every[high > 0] if (high > 0).any() else every
 
 
-def _some(at: Sampling, among: Int) -> Sampling:
-    """A few instants among some times, and channels, of a sampling, the first and the last among them."""
-    times = among[np.unique(np.linspace(0, len(among) - 1, INSTANTS).round().astype(int))]
+def _zenith(at: Sampling, grid: ImageGrid) -> tuple[int, Float]:
+    """The time at which a zenith comes nearest to a grid, and places (l, m) about it where it lies within, (N, 2).
+
+    Axes of azimuth turn about it, and published elements differ there by the azimuth from which they are seen.
+    """
+    assert grid.centre is not None  # placed, or it would have been refused
+    axes = at.layout.axes[at.layout.frames[0], 2]
+    found = lmn((axes @ at.earth.matrices).reshape(-1, 3), grid.centre).reshape(len(at.earth), -1, 3)
+    beyond = (np.abs(found[..., :2]) / _half(grid)).max(axis=-1) + 9.0 * (found[..., 2] < -1)
+    t, g = np.unravel_index(int(np.argmin(beyond)), beyond.shape)
+    ring = np.exp(2j * np.pi * np.arange(8) / 8)[:, None] * [1e-4, 1e-3, 1e-2]
+    near = found[t, g, :2] + np.stack([ring.real, ring.imag], axis=-1).reshape(-1, 2)
+    return int(t), near[(np.abs(near) < _half(grid)).all(axis=1)]
+
+
+def _some(at: Sampling, among: Int, one: int) -> Sampling:
+    """A few instants among some times and `one`, and channels, of a sampling, the first and the last among them."""
+    times = among[np.linspace(0, len(among) - 1, INSTANTS).round().astype(int)]
+    times = np.unique(np.append(times, one))
     channels = np.unique(np.linspace(0, at.shape[1] - 1, BANDS).round().astype(int))
     ranked = np.argsort(at.freq_hz)[channels]
     return replace(at.some(times), freq_hz=at.freq_hz[np.sort(ranked)])

@@ -165,3 +165,21 @@ def test_an_image_that_rises_or_sets_is_refused_and_one_that_stands_low_is_right
     few = np.arange(0, 240, 40)
     due = np.array([definition(plan.problem.block(slice(t, t + 1), EVERY)) for t in few])
     assert np.abs(ready.sums(EVERY, EVERY)[few, 0] - due).max() <= ready.bound * plan.scale_jy
+
+
+def test_a_zenith_within_the_image_is_seen_for_what_it_is():
+    """Hamaker's element depends there on the azimuth: 7e-5 of the flux was wrong at a bound of 4e-6."""
+    night = Observation(
+        phase_centre="08h13m36.0s +52d54m55s", transit="2012-12-07", duration=3 * u.hour, interval=3 * u.min,
+        frequencies=[150] * u.MHz,
+    )  # fmt: skip
+    sky = ImageSky(
+        grid=ImageGrid(pixels=20, pixel=6 * u.arcmin), stokes=np.random.default_rng(0).normal(size=(1, 4, 20, 20))
+    )
+    scene = Scene(instrument=instrument.load("telescopes", "lofar-hba", stations=NAMES), sky=sky, observation=night)
+    plan = scene.plan(tolerance=1e-2, engine="direct")
+    with pytest.raises(RefusedError, match="a zenith or a celestial pole"):
+        Gridded().prepare(plan.problem, 1e-5)
+    ready = Gridded().prepare(plan.problem, 0.1)
+    due = np.array([definition(plan.problem.block(slice(t, t + 1), EVERY)) for t in range(24, 36)])
+    assert np.abs(ready.sums(EVERY, EVERY)[24:36, 0] - due).max() <= ready.bound * plan.scale_jy
