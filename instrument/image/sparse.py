@@ -15,6 +15,7 @@ import numpy as np
 from instrument.compiled import compiled
 from instrument.image.clock import Clock, ever_within, turns
 from instrument.observe.directions import LIGHT
+from instrument.predict.base import Problem
 from instrument.predict.time_samples import TimeSamples, growth, kernels, steps, taps_for, time_samples, with_skirts
 from instrument.units import Bool, Complex, Float, Int
 
@@ -24,6 +25,23 @@ SURE = 1.5  # ducc0's error of one visibility over the one that it is asked for:
 COLUMNS = 10  # real and imaginary parts of I, Q, U, V; weights of I and of U
 SAMPLE = 8.0 * COLUMNS  # bytes
 PAYS = 0.5  # samples in place of as many visibilities, at most
+
+
+def share(problem: Problem, imager: Any) -> float:
+    """Samples that are gridded for each visibility of the middle channel of a run, for its plan; 1: all as they are."""
+    times, channels, _ = problem.shape
+    if times <= FEW or not problem.at.regular(problem.interval_s):
+        return 1.0
+    freq_hz = float(problem.at.freq_hz[channels // 2])
+    first, places = problem.at.at_centre().block(slice(0, 1), slice(0, 1)), problem.at.layout.positions_m
+    baselines = places[problem.antenna1] - places[problem.antenna2]
+    use = ever_within(first, baselines, freq_hz, imager.uv_range)
+    rates = with_skirts(
+        turns(first, baselines[use], freq_hz, imager.pixel * imager.pixels / 2), BETWEEN * imager.accuracy
+    )
+    each = float(np.mean(1 / steps(rates, problem.interval_s))) if use.any() else 1.0
+    found = each + taps_for(BETWEEN * imager.accuracy)[0] / times
+    return found if found <= PAYS else 1.0
 
 
 @dataclass(frozen=True)

@@ -180,6 +180,6 @@ def test_a_zenith_within_the_image_is_seen_for_what_it_is():
     plan = scene.plan(tolerance=1e-2, engine="direct")
     with pytest.raises(RefusedError, match="a zenith or a celestial pole"):
         Gridded().prepare(plan.problem, 1e-5)
-    ready = Gridded().prepare(plan.problem, 0.1)
+    ready = Gridded().prepare(plan.problem, 0.3)
     due = np.array([definition(plan.problem.block(slice(t, t + 1), EVERY)) for t in range(24, 36)])
     assert np.abs(ready.sums(EVERY, EVERY)[24:36, 0] - due).max() <= ready.bound * plan.scale_jy

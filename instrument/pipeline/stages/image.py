@@ -14,7 +14,7 @@ from instrument.errors import InputError, did_you_mean, unused
 from instrument.image.base import AnyImager, ImageSums, Kept
 from instrument.image.cube import SolidAngle, StokesCube
 from instrument.image.dirty import ALL_HELD, HELD, WAITING, Imager
-from instrument.image.sparse import SAMPLE
+from instrument.image.sparse import SAMPLE, share
 from instrument.memory import afford
 from instrument.numbers import brief
 from instrument.observe.directions import LIGHT
@@ -108,8 +108,9 @@ def imaging(imager: AnyImager, run: Running, count: int = 1) -> StageWork:
     # a density of the uv plane, and a first pass over coordinates for it
     weighed = 0.0 if imager.weighting == "natural" else 1.0
     together = min(HELD, chosen / channels)
-    calls = 5 * np.ceil(chosen / max(together, 1.0))
-    seconds = GRIDDING * 5 * chosen + (1 + weighed) * PICKING * run.visibilities + TURNING * calls * imager.pixels**2
+    gridded = chosen * share(run.plan.problem, imager)
+    calls = 5 * max(channels, np.ceil(gridded / HELD))
+    seconds = GRIDDING * 5 * gridded + (1 + weighed) * PICKING * run.visibilities + TURNING * calls * imager.pixels**2
     return StageWork(
         f"{count_of(count * channels, 'image')} of {imager.pixels} x {imager.pixels} in I, Q, U, V and the PSF",
         seconds=count * seconds,
