@@ -24,7 +24,8 @@ def main():
     parser.add_argument("--out", type=Path, default=Path("docs/reports"))
     parser.add_argument("--iterations", default="16,40")
     given = parser.parse_args()
-    file = parse(override(read_tables("galactic-quick"), ["observation.frequency.channels=1"]))
+    changes = ["observation.frequency.channels=1", "analyze.cube.products=['spectrum-2d']"]
+    file = parse(override(read_tables("galactic-quick"), changes))
     scene = file.scene()
     plan = file.plan(scene)
     vis = plan.run()

@@ -45,7 +45,7 @@ def bands(split):
 def published(folder, planes, maps):
     """Maps less A A^+ maps, A by the published GMCA on wavelet planes (its defaults), and its seconds."""
     sys.path.insert(0, str(folder))
-    setattr(np, "int", int)  # noqa: B010 - it was written for numpy before 1.24
+    vars(np).setdefault("int", int)  # it was written for numpy before 1.24
     import gmca
 
     def run():

@@ -12,27 +12,27 @@ import sys
 import tempfile
 import time
 from datetime import date
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parents[1] / "tests" / "fuzz"))
 
-from fuzzing import seeds  # noqa: E402
-from fuzzing.choose import cases  # noqa: E402
-from fuzzing.harness import Verdict, Zygote, tally  # noqa: E402
+seeds, choose, harness = (import_module(f"fuzzing.{name}") for name in ("seeds", "choose", "harness"))
 
 WARM = [["run", "s.toml", "--no-verify", "--out", "warm"], ["run", "i.toml", "--out", "warm2"]]
 
 
-def run(count: int, seed: int) -> list[Verdict]:
+def run(count: int, seed: int) -> list[Any]:
     """The verdicts; faults are printed as they come."""
     folder = Path(tempfile.mkdtemp(prefix="fuzz"))
     (folder / "s.toml").write_text(seeds.SCENE)
     (folder / "i.toml").write_text(seeds.IMAGES)
     found = []
-    with Zygote(WARM, folder) as zygote:
-        for number, case in enumerate(cases(count, seed, folder / "seeds")):
+    with harness.Zygote(WARM, folder) as zygote:
+        for number, case in enumerate(choose.cases(count, seed, folder / "seeds")):
             found.append(zygote.judge(case))
             if not found[-1].good:
                 print(f"{number}: {found[-1]}\n", flush=True)
@@ -42,9 +42,9 @@ def run(count: int, seed: int) -> list[Verdict]:
     return found
 
 
-def report(found: list[Verdict], seed: int, seconds: float) -> str:
+def report(found: list[Any], seed: int, seconds: float) -> str:
     """The page."""
-    rows = tally(found)
+    rows = harness.tally(found)
     total = {key: sum(row[key] for row in rows.values()) for key in ("cases", "done", "long", "refused", "faults")}
     total |= {key: max(row[key] for row in rows.values()) for key in ("most_ms", "most_mb")}
     lines = [

@@ -7,31 +7,29 @@ each, in turn, the best of several. WSClean is timed as a process, from a Measur
 four images without a PSF; without WSClean or casacore the table says so. Writes imaging_speed.md beside this file.
 """
 
+import argparse
 import os
+import platform
+import shutil
+import sys
+import tempfile
+import time
+from datetime import date
+from importlib.metadata import version
+from pathlib import Path
 
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "DUCC0_NUM_THREADS")
-os.environ.update(dict.fromkeys(THREADS, "1"))  # before numpy is loaded
+import numpy as np
+from astropy import units as u
+from ducc0.wgridder.experimental import vis2dirty
+from peers import peer_tools, process
 
-import argparse  # noqa: E402
-import platform  # noqa: E402
-import shutil  # noqa: E402
-import tempfile  # noqa: E402
-import time  # noqa: E402
-from datetime import date  # noqa: E402
-from importlib.metadata import version  # noqa: E402
-from pathlib import Path  # noqa: E402
-
-import numpy as np  # noqa: E402
-from astropy import units as u  # noqa: E402
-from ducc0.wgridder.experimental import vis2dirty  # noqa: E402
-from peers import peer_tools, process  # noqa: E402
-
-import instrument  # noqa: E402
-from instrument.image.clock import Clock  # noqa: E402
-from instrument.image.sparse import Comb  # noqa: E402
-from instrument.observe.directions import LIGHT  # noqa: E402
-from instrument.observe.sampling import Sampling  # noqa: E402
-from instrument.predict.gridding import Gridder  # noqa: E402
+import instrument
+from instrument.image.clock import Clock
+from instrument.image.sparse import Comb
+from instrument.observe.directions import LIGHT
+from instrument.observe.sampling import Sampling
+from instrument.predict.gridding import Gridder
+from instrument.threads import THREADS
 
 HERE = Path(__file__).parent
 CENTRE, PIXELS, ACCURACY, FREQ, UV = "08h13m36.0s +48d13m03s", 480, 1e-4, 150e6, (30, 800)
@@ -177,4 +175,6 @@ made; this package starts from correlations of all baselines, and works out whic
 
 
 if __name__ == "__main__":
+    if os.environ.get(THREADS[0]) != "1":  # libraries read it when they are loaded: begin again with one thread
+        os.execve(sys.executable, [sys.executable, *sys.argv], {**os.environ, **dict.fromkeys(THREADS, "1")})
     main()

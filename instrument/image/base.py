@@ -169,6 +169,23 @@ class AnyImager(Component):
         return ""
 
 
+@checked
+class SolvingImager(AnyImager):
+    """An imager that makes a model of the sky too: a subclass writes `imaged`, whose cube is the image."""
+
+    def image(
+        self, visibilities: VisibilitySet | Iterable[Visibilities], operator: ImageOperator | None = None
+    ) -> StokesCube:
+        """Images in Jy/beam (F, 4, N, N) with their PSF; see `imaged`."""
+        return self.imaged(visibilities, operator).cube
+
+    @abstractmethod
+    def imaged(
+        self, visibilities: VisibilitySet | Iterable[Visibilities], operator: ImageOperator | None = None
+    ) -> Imaged:
+        """The images, cubes of the same size beside them, and how it ended."""
+
+
 class Kept(ImageSums):
     """Blocks kept in a file of their own, for an imager that goes through all of them, or more than once."""
 

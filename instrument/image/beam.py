@@ -11,7 +11,7 @@ from pydantic import Field
 from instrument import mat2
 from instrument.checked import checked
 from instrument.errors import InputError, RefusedError
-from instrument.image.base import AnyImager, Imaged, Kept
+from instrument.image.base import Imaged, Kept, SolvingImager
 from instrument.image.beam_solve import Channel, Corrected, joint, normalised, predicted
 from instrument.image.beam_weights import mueller_weights
 from instrument.image.cube import StokesCube
@@ -35,7 +35,7 @@ SAME = 1e-9  # of a frequency or a time, by which data and an operator may diffe
 
 
 @checked
-class BeamImager(AnyImager):
+class BeamImager(SolvingImager):
     """Images of the sky before the beams, (F, 4, N, N) in Jy/beam, of visibilities as they were seen through them.
 
     Every visibility is taken back through the beams of its stations at its time (A^H w V, with all four Stokes
@@ -63,12 +63,6 @@ class BeamImager(AnyImager):
     amplification: Annotated[float, Field(gt=1)] = 10.0
     tolerance: Annotated[float, TOLERANCE] = 1e-5
     mask: Annotated[Any, ArrayOf(bool, (None, None))] | None = None
-
-    def image(
-        self, visibilities: VisibilitySet | Iterable[Visibilities], operator: ImageOperator | None = None
-    ) -> StokesCube:
-        """Images of the sky before the beams; see `imaged`."""
-        return self.imaged(visibilities, operator).cube
 
     def imaged(
         self, visibilities: VisibilitySet | Iterable[Visibilities], operator: ImageOperator | None = None

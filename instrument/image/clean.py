@@ -7,7 +7,6 @@ from collections.abc import Iterable
 from instrument.checked import checked
 from instrument.image.base import Imaged
 from instrument.image.clean_settings import Cleaning
-from instrument.image.cube import StokesCube
 from instrument.image.cycles import Cycles
 from instrument.predict.operator import ImageOperator
 from instrument.visibilities import Visibilities, VisibilitySet
@@ -35,12 +34,6 @@ class CleanImager(Cleaning):
 
     `backend` "radler" has the minor cycles done by that library, in float32 (extra `radler`).
     """
-
-    def image(
-        self, visibilities: VisibilitySet | Iterable[Visibilities], operator: ImageOperator | None = None
-    ) -> StokesCube:
-        """Restored images in Jy/beam (F, 4, N, N) with their PSF; see `imaged`."""
-        return self.imaged(visibilities, operator).cube
 
     def imaged(
         self, visibilities: VisibilitySet | Iterable[Visibilities], operator: ImageOperator | None = None

@@ -7,13 +7,13 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, field_validator, model_validator
 
 from instrument.errors import InputError
-from instrument.image.base import AnyImager
+from instrument.image.base import SolvingImager
 from instrument.image.dirty import Imager
 from instrument.image.weights import Weighting
 from instrument.units import ArrayOf, Count, Jansky, Radians
 
 
-class Cleaning(AnyImager):
+class Cleaning(SolvingImager):
     """What an imager that cleans is told; `CleanImager` says what each means."""
 
     restores: ClassVar[bool] = True
