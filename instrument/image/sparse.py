@@ -30,7 +30,7 @@ PAYS = 0.5  # samples in place of as many visibilities, at most
 def share(problem: Problem, imager: Any) -> float:
     """Samples that are gridded for each visibility of the middle channel of a run, for its plan; 1: all as they are."""
     times, channels, _ = problem.shape
-    if times <= FEW or not problem.at.regular(problem.interval_s):
+    if times <= FEW or np.ptp(np.diff(problem.at.slots_s)) > 1e-5:
         return 1.0
     freq_hz = float(problem.at.freq_hz[channels // 2])
     first, places = problem.at.at_centre().block(slice(0, 1), slice(0, 1)), problem.at.layout.positions_m
