@@ -17,6 +17,7 @@ from instrument.checked import checked
 from instrument.component import Component
 from instrument.errors import FileError, InputError, RefusedError
 from instrument.image.cube import StokesCube
+from instrument.image.pixel_map import PixelMap
 from instrument.image.psf import Psf
 from instrument.image.weights import Density
 from instrument.observe.directions import LIGHT
@@ -31,11 +32,15 @@ from instrument.visibility_sets import VisibilityFile
 
 @dataclass(frozen=True)
 class Imaged:
-    """What an imager has made: the cube, cubes beside it by name (a residual), and what a run records of it."""
+    """What an imager has made: the cube, cubes beside it by name (a residual), and what a run records of it.
+
+    `maps` are by name what else is known of its pixels (noise amplification), which a run writes beside the cube.
+    """
 
     cube: StokesCube
     beside: Mapping[str, StokesCube] = field(default_factory=dict)
     record: Mapping[str, Any] = field(default_factory=dict)
+    maps: Mapping[str, PixelMap] = field(default_factory=dict)
 
 
 class ImageSums(ABC):

@@ -16,6 +16,7 @@ from instrument.image.beam_solve import Channel, Corrected, joint, normalised, p
 from instrument.image.beam_weights import mueller_weights
 from instrument.image.cube import StokesCube
 from instrument.image.minor import Folding, restored
+from instrument.image.pixel_map import PixelMap
 from instrument.image.psf import Psf, fit_psf
 from instrument.jones.chain import Chain
 from instrument.jones.towards import Towards
@@ -52,12 +53,14 @@ class BeamImager(SolvingImager):
 
     The solutions take at most `iterations`, and end when the visibilities are met to the tolerance of the operator.
     A visibility counts where all four correlations are known; a channel without any is NaN. Pixels where the noise of a
-    Stokes parameter is more than `amplification` times that of the best pixel have no data. `tolerance` is that of an
+    Stokes parameter is more than `amplification` times that of the best pixel have no data; `imaged` gives that ratio
+    and the condition number of the matrices as maps. `tolerance` is that of an
     operator that a run makes; `image` takes one (`plan.operator`), or sees no beams.
     """
 
     through_beams: ClassVar[bool] = True
     planes_held: ClassVar[float] = 80  # of one channel: its matrices, the functions of the nodes, the solution
+    planes_made: ClassVar[float] = 16  # with model and residual, and five maps in float32
     way: Literal["normalised", "joint", "predict"] = "normalised"
     iterations: Annotated[int, Field(ge=1, le=1000)] = 16
     amplification: Annotated[float, Field(gt=1)] = 10.0
@@ -68,6 +71,8 @@ class BeamImager(SolvingImager):
         self, visibilities: VisibilitySet | Iterable[Visibilities], operator: ImageOperator | None = None
     ) -> Imaged:
         """The same with the "model" (Jy/pixel) beside them, and how each channel ended under "beam".
+
+        The maps are "amplification" (F, 4, N, N) and "condition" (F, 1, N, N).
 
         Of the way "joint" the cube is the restored one, and the "residual" stands beside it too.
 
@@ -82,13 +87,13 @@ class BeamImager(SolvingImager):
             return kept.everything()
         done = [self._channel(_channel_of(given, f), operator) for f in range(len(given.freq_hz))]
         first = _channel_of(given, 0)
-        if all(found.record["without_data"] == 1.0 for found, _ in done):
+        if all(found.record["without_data"] == 1.0 for found, _, _ in done):
             raise RefusedError(
                 f"no visibility within uv_range = {self.uv_range} has all four correlations with a weight above 0: "
                 "nothing to image"
             )
-        psf = fit_psf(np.stack([psf for _, psf in done]), self.pixel)
-        images, models = (np.stack([getattr(found, name) for found, _ in done]) for name in ("images", "model"))
+        psf = fit_psf(np.stack([psf for _, psf, _ in done]), self.pixel)
+        images, models = (np.stack([getattr(found, name) for found, *_ in done]) for name in ("images", "model"))
         beside = {}
         if self.way != "normalised":
             beside["model"] = self._cube(first, given, models, "Jy/pixel")
@@ -96,7 +101,13 @@ class BeamImager(SolvingImager):
             beside["residual"] = self._cube(first, given, images, "Jy/beam")
             images = images + self._restored(models, psf)
         cube = self._cube(first, given, images, "Jy/beam").with_psf(psf)
-        return Imaged(cube, beside, {"beam": [found.record for found, _ in done]})
+        made = np.stack([maps for *_, maps in done])
+        text = f"noise over that of the best pixel; above {self.amplification:g} a pixel has no data"
+        maps = {
+            "amplification": PixelMap(made[:, :4], cube, text),
+            "condition": PixelMap(made[:, 4:], cube, "condition number of the Mueller matrix of a pixel"),
+        }
+        return Imaged(cube, beside, {"beam": [found.record for found, *_ in done]}, maps)
 
     @property
     def operator_tolerance(self) -> float:
@@ -140,8 +151,8 @@ class BeamImager(SolvingImager):
             constants="data",
         )  # fmt: skip
 
-    def _channel(self, block: Visibilities, operator: ImageOperator | None) -> tuple[Corrected, Any]:
-        """The images of one channel, and its PSF (N, N)."""
+    def _channel(self, block: Visibilities, operator: ImageOperator | None) -> tuple[Corrected, Float, Any]:
+        """The images of one channel, its PSF (N, N), and the maps of its matrices (5, N, N)."""
         grid = self.grid(block.phase_centre)
         operator = operator or self._plain(block, grid)
         operator.demand(grid, self.uv_range)
@@ -150,7 +161,8 @@ class BeamImager(SolvingImager):
         weight = weight * _within(block, self.uv_range)
         if not weight.any():
             blank = np.full((4, *grid.pixels), np.nan)
-            return Corrected(blank, blank, {"without_data": 1.0}), blank[0]
+            none = np.full((5, *grid.pixels), np.nan, np.float32)
+            return Corrected(blank, blank, {"without_data": 1.0}), blank[0], none
         channel = _place(block, operator)
         problem = operator.problem.block(EVERY, channel).between(block.antenna1, block.antenna2)
         weights = mueller_weights(problem, grid, weight[:, 0], self.amplification, centre)
@@ -167,15 +179,15 @@ class BeamImager(SolvingImager):
             found = normalised(seen)
         found.record["condition"] = float(np.max(weights.condition[weights.usable]))
         found.record["without_data"] = float(np.mean(~weights.usable))
-        return found, self._psf(seen)
+        return found, self._psf(seen), weights.maps
 
-    def _psf(self, seen: Channel) -> Any:
+    def _psf(self, seen: Channel) -> Float:
         """What a point of 1 Jy in I at the centre becomes in I, without any correction but for its own matrix."""
         point = np.zeros((4, self.pixels, self.pixels))
         middle = self.pixels // 2
         point[0, middle, middle] = 1.0
         image = seen.back(seen.seen(point), (0,))[0]
-        return image / image[middle, middle]
+        return np.asarray(image / image[middle, middle])
 
     def _plain(self, block: Visibilities, grid: ImageGrid) -> ImageOperator:
         """An operator without beams, for data of which none are known."""

@@ -34,6 +34,11 @@ class MuellerWeights:
     amplification: Float
     condition: Float
 
+    @property
+    def maps(self) -> Float:
+        """Amplification of I, Q, U, V and the condition number, float32 (5, Ny, Nx)."""
+        return np.asarray(np.concatenate([self.amplification, self.condition[None]]), np.float32)
+
     def undone(self, images: Float) -> Float:
         """Images (4, Ny, Nx) through the inverse of the matrices; NaN where that is not usable."""
         out = np.full(images.shape, np.nan)

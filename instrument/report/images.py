@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import SymLogNorm
+from matplotlib.colors import LogNorm, Normalize, SymLogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse, Rectangle
@@ -15,11 +16,13 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
 from instrument.errors import InputError
+from instrument.report.spectra import log_numbers
 from instrument.report.style import INK, axes_of, styled
 from instrument.units import Float
 
 if TYPE_CHECKING:
     from instrument.image.cube import StokesCube
+    from instrument.image.pixel_map import PixelMap
 
 FIT, HALF = "#ffe000", "#0026ff"
 MOST = 600  # pixels of an image that are drawn along an axis: a panel has 350 of its own
@@ -64,6 +67,33 @@ def stokes_images(cube: StokesCube, channel: int = 0) -> Figure:
     if step > 1:
         title += f"\neach dot: the largest of {step} x {step} pixels"
     figure.suptitle(title, fontsize=13)
+    return figure
+
+
+@styled
+def pixel_maps(maps: Mapping[str, PixelMap], channel: int = 0) -> Figure:
+    """Maps of one channel side by side, of the Stokes parameter with the largest value; pixels without data in grey.
+
+    Colours end at the values of pixels that have data; they are logarithmic where these span more than a factor 10.
+    """
+    figure = Figure(figsize=(6.4 * len(maps), 5.6), layout="compressed")
+    for ax, (name, one) in zip(figure.subplots(1, len(maps), squeeze=False)[0], maps.items(), strict=True):
+        values = np.asarray(one.data[channel].max(axis=0), float)
+        values, extent, _ = _shrunk(values, np.rad2deg(one.cube.pixel_rad))
+        there = np.isfinite(one.cube.data[channel]).all(axis=0)
+        there, _, _ = _shrunk(there.astype(float), np.rad2deg(one.cube.pixel_rad))
+        inside = values[(there > 0) & np.isfinite(values)]
+        low, high = (float(inside.min()), float(inside.max())) if len(inside) else (1.0, 10.0)
+        norm = LogNorm(low, high) if high > 10 * low else Normalize(low, max(high, 1.01 * low))
+        shown = np.where(np.isfinite(values) & (there > 0), values, np.nan)
+        drawn = ax.imshow(shown, extent=extent, origin="lower", cmap="viridis", norm=norm, interpolation="nearest")
+        ax.set_facecolor("#bbbbbb")
+        bar = figure.colorbar(drawn, ax=ax, fraction=0.046, pad=0.02)
+        if isinstance(norm, LogNorm):
+            log_numbers(bar.ax.yaxis, high / low)
+        ax.set_title(name + (", the largest of I, Q, U, V" if one.data.shape[1] > 1 else ""))
+        ax.set(xlabel="offset east (deg)", ylabel="offset north (deg)")
+    figure.suptitle(f"{next(iter(maps.values())).freq_hz[channel] / 1e6:.6g} MHz")
     return figure
 
 

@@ -3,11 +3,15 @@
 import numpy as np
 import pytest
 from astropy import units as u
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
 
 import instrument
-from instrument import BeamImager, CleanImager, ImageGrid, ImageSky, InputError, Observation, Scene
+from instrument import BeamImager, CleanImager, ImageGrid, ImageSky, InputError, Observation, Scene, read_cube
+from instrument.cli import main
 from instrument.errors import RefusedError
 from instrument.image.beam_weights import mueller_weights
+from instrument.observe.directions import offset
 from instrument.predict.base import EVERY
 
 PIXEL = 8 * u.arcmin
@@ -114,6 +118,50 @@ def test_what_cannot_be_undone_is_masked_or_refused():
         imager.with_fields(pixels=32).image(vis, operator)
     with pytest.raises(InputError, match="not the times and channels"):
         imager.image(vis.block(slice(0, 2), slice(0, 1)), operator)
+
+
+def test_maps_of_noise_and_condition_are_those_of_the_matrices_and_say_where_data_end(tmp_path):
+    """Noise is the root of the diagonal of the inverse of differential matrices; NaN is what is above the limit."""
+    plan = plan_of(sources()[0], stations=SOME[:6], interval=2 * u.hour)
+    vis, operator = plan.run(), plan.operator(ImageGrid(pixels=24, pixel=PIXEL), 1e-4)
+    made = BeamImager(pixels=24, pixel=PIXEL, uv_range=UV, amplification=1.5).imaged(vis, operator)
+    noise, condition = made.maps["amplification"].data, made.maps["condition"].data
+    assert (noise.shape, condition.shape) == ((1, 4, 24, 24), (1, 1, 24, 24))
+    beyond = (noise > 1.5).any(axis=1)
+    assert 0 < beyond.mean() < 1
+    assert np.array_equal(beyond, np.isnan(made.cube.data).any(axis=1))
+    y, x = np.array([12, 3]), np.array([12, 18])
+    length = np.hypot(vis.uvw_m[..., 0], vis.uvw_m[..., 1]) * vis.freq_hz[0] / 299792458
+    weight = (length > UV[0]) & (length < UV[1])
+    lofar, names, due = lofar_of(plan), plan.problem.at.layout.names, np.zeros((2, 4, 4))
+    at = SkyCoord(*offset(made.cube.centre, made.cube.grid.east[x], made.cube.grid.north[y]), unit="rad")
+    for b, pair in enumerate(zip(vis.antenna1, vis.antenna2, strict=True)):
+        seen = lofar.mueller(
+            at, vis.times, [150] * u.MHz, made.cube.centre.skycoord, tuple(names[p] for p in pair), "differential"
+        )
+        due += np.einsum("t,tfsji,tfsjk->sik", weight[:, b], seen.conj(), seen).real
+    np.testing.assert_allclose(condition[0, 0, y, x], np.linalg.cond(due), rtol=1e-4)
+    here, there = np.sqrt(np.diagonal(np.linalg.inv(due), axis1=1, axis2=2))
+    np.testing.assert_allclose(noise[0, :, 3, 18] / noise[0, :, 12, 12], there / here, rtol=1e-4)
+    made.maps["amplification"].write(tmp_path / "amplification.fits")
+    with fits.open(tmp_path / "amplification.fits") as found:
+        assert np.array_equal(found[0].data, noise) and found[0].header["BUNIT"] == ""
+        assert found[0].header["CRVAL1"] == pytest.approx(np.rad2deg(made.cube.centre.ra_rad))
+
+
+def test_a_run_writes_the_maps_and_shows_them(tmp_path):
+    settings = ["instrument.stations=['CS001HBA0','CS002HBA0','CS003HBA1','CS004HBA0','CS005HBA1','CS006HBA0']"]
+    settings += ["observation.interval='2 h'", "sky.shape=[3,3]", "image.pixels=24", "image.pixel='10 arcmin'"]
+    settings += ["image.tolerance=1e-3", "image.amplification=1.5", "image.way='normalised'", "image.uv_range=[20,200]"]
+    words = [w for one in settings for w in ("--set", one)]
+    assert main(["run", "aw-correction", "--out", str(tmp_path / "out"), *words]) == 0
+    for name in ("amplification", "condition"):
+        with fits.open(tmp_path / "out" / f"{name}.fits") as found:
+            assert np.isfinite(found[0].data).all()
+    page = (tmp_path / "out" / "report.html").read_text()
+    blank = np.isnan(read_cube(tmp_path / "out" / "cube.fits").data[0, 0]).mean()
+    assert f"{blank:.0%} of the pixels have none" in page
+    assert (tmp_path / "out" / "maps.png").is_file()
 
 
 def test_a_wrong_beam_leaves_leakage_in_proportion():

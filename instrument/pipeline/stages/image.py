@@ -14,6 +14,7 @@ from instrument.errors import InputError, did_you_mean, unused
 from instrument.image.base import AnyImager, ImageSums, Kept
 from instrument.image.cube import SolidAngle, StokesCube
 from instrument.image.dirty import ALL_HELD, HELD, WAITING, Imager
+from instrument.image.pixel_map import PixelMap
 from instrument.image.sparse import SAMPLE, share
 from instrument.memory import afford
 from instrument.numbers import brief
@@ -150,17 +151,18 @@ class _ImageRun(StageRun):
     def finish(self) -> StageResult:
         """The cube."""
         made = self.images.everything()
-        return ImageResult(self.imager, made.cube, made.beside, made.record)
+        return ImageResult(self.imager, made.cube, made.beside, made.record, made.maps)
 
 
 @dataclass(frozen=True)
 class ImageResult(StageResult):
-    """Images of a run: a cube with its PSF, cubes beside it by name, and what the imager says of them."""
+    """Images of a run: a cube with its PSF, cubes and maps beside it by name, and what the imager says of them."""
 
     imager: AnyImager
     cube: StokesCube
     beside: Mapping[str, StokesCube] = field(default_factory=dict)
     said: Mapping[str, Any] = field(default_factory=dict)
+    maps: Mapping[str, PixelMap] = field(default_factory=dict)
 
     def record(self) -> dict[str, Any]:
         """Unit, PSF and rms of the first channel."""
@@ -179,10 +181,10 @@ class ImageResult(StageResult):
         }
 
     def write(self, folder: Path) -> None:
-        """cube.fits, and those beside it: model.fits, residual.fits."""
-        self.cube.write(folder / "cube.fits")
-        for name, cube in self.beside.items():
-            cube.write(folder / f"{name}.fits")
+        """cube.fits, and what is beside it: model.fits, residual.fits, amplification.fits, condition.fits."""
+        made: dict[str, StokesCube | PixelMap] = {"cube": self.cube, **self.beside, **self.maps}
+        for name, one in made.items():
+            one.write(folder / f"{name}.fits")
 
     def cards(self) -> list[Card]:
         """The PSF."""
@@ -193,7 +195,7 @@ class ImageResult(StageResult):
 
     def sections(self, draw: Draw) -> list[Section]:
         """Images of the first, middle and last channel, the PSF, and the rms of each Stokes parameter in them."""
-        from instrument.report.images import psf_image, stokes_images
+        from instrument.report.images import pixel_maps, psf_image, stokes_images
 
         count = len(self.cube.freq_hz)
         shown = {name: k for k, name in {0: "first", count // 2: "middle", count - 1: "last"}.items()}
@@ -208,6 +210,11 @@ class ImageResult(StageResult):
         if self.cube.psf is not None and self.cube.psf.data is not None:
             text = "Point spread function and the Gaussian fitted to its main lobe."
             entries.append(draw("psf", psf_image(self.cube), text))
+        if self.maps:
+            blank = np.isnan(self.cube.data[count // 2]).any(axis=0).mean()
+            parts = [f"{name}, {one.what}" for name, one in self.maps.items()]
+            text = f"Maps: {'; '.join(parts)}. {blank:.0%} of the pixels have none."
+            entries.append(draw("maps", pixel_maps(self.maps, count // 2), text, wide=True))
         heads = [f"{self.cube.freq_hz[k] / 1e6:.6g} MHz" for k in shown.values()]
         rows = [[stokes, *(float(values[s]) for values in rms.values())] for s, stokes in enumerate("IQUV")]
         text = f"Rms of the images, {self.cube.unit}."
