@@ -9,6 +9,8 @@ import numpy as np
 from instrument import mat2
 from instrument.units import Bool, Complex, Float
 
+ALL_FOUR = np.ones((2, 2), bool)
+ALL_FOUR.setflags(write=False)
 APART = 5  # axes of an array that has values for each correlation, (T, F, B, 2, 2)
 
 
@@ -33,12 +35,12 @@ def plain_axes(array: Any) -> Any:
     return np.broadcast_to(array, (*array.shape[:3], 2, 2)) if set(array.shape[3:]) == {1, 2} else array
 
 
-def whole(weight: Float) -> Float:
+def whole(weight: Float, of: Bool = ALL_FOUR) -> Float:
     """Weights (T, F, B) of visibilities as a whole, of those of correlations: the harmonic mean, 0 where one is 0.
 
-    That is the inverse of the mean variance, so four that are alike stay as they are.
+    That is the inverse of the mean variance, so four that are alike stay as they are. With `of` (2, 2) of some only.
     """
-    return weight if weight.ndim < APART else _harmonic(weight.reshape(*weight.shape[:3], 4))
+    return weight if weight.ndim < APART else _harmonic(weight[..., of])
 
 
 def of_stokes(weight: Float) -> Float:

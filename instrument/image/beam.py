@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from instrument import mat2
+from instrument import correlations, mat2
 from instrument.checked import checked
 from instrument.errors import InputError, RefusedError
 from instrument.image.base import Imaged, Kept, SolvingImager
@@ -25,7 +25,7 @@ from instrument.observe.directions import LIGHT, lmn
 from instrument.observe.grid import ImageGrid
 from instrument.predict.base import EVERY, Problem
 from instrument.predict.gridded import image_operator
-from instrument.predict.operator import ImageOperator
+from instrument.predict.operator import STOKES, ImageOperator
 from instrument.sky.base import PlacedSky
 from instrument.sky.points import PointSky, points_of
 from instrument.units import ArrayOf, Direction, Float, unit_vectors
@@ -52,10 +52,11 @@ class BeamImager(SolvingImager):
       predicted and taken out. For diffuse polarized skies where I is faint.
 
     The solutions take at most `iterations`, and end when the visibilities are met to the tolerance of the operator.
-    A visibility counts where all four correlations are known; a channel without any is NaN. Pixels where the noise of a
-    Stokes parameter is more than `amplification` times that of the best pixel have no data; `imaged` gives that ratio
-    and the condition number of the matrices as maps. `tolerance` is that of an
-    operator that a run makes; `image` takes one (`plan.operator`), or sees no beams.
+    A visibility counts where all four correlations are known, or all that any visibility of the channel has: a Stokes
+    parameter that these do not see is NaN there. A channel without any is NaN. Pixels where the noise of a Stokes
+    parameter is more than `amplification` times that of the best pixel have no data; `imaged` gives that ratio and the
+    condition number of the matrices as maps. `tolerance` is that of an operator that a run makes; `image` takes one
+    (`plan.operator`), or sees no beams.
     """
 
     through_beams: ClassVar[bool] = True
@@ -156,8 +157,9 @@ class BeamImager(SolvingImager):
         grid = self.grid(block.phase_centre)
         operator = operator or self._plain(block, grid)
         operator.demand(grid, self.uv_range)
-        block, centre = _without_centre(block, operator.problem.chain)
-        weight = block.whole_weight * np.ones(block.data.shape[:3])
+        known = _known(block)
+        block, centre = _without_centre(block, operator.problem.chain, known)
+        weight = correlations.whole(block.effective_weight, known) * np.ones(block.data.shape[:3])
         weight = weight * _within(block, self.uv_range)
         if not weight.any():
             blank = np.full((4, *grid.pixels), np.nan)
@@ -165,8 +167,8 @@ class BeamImager(SolvingImager):
             return Corrected(blank, blank, {"without_data": 1.0}), blank[0], none
         channel = _place(block, operator)
         problem = operator.problem.block(EVERY, channel).between(block.antenna1, block.antenna2)
-        weights = mueller_weights(problem, grid, weight[:, 0], self.amplification, centre)
-        seen = Channel(operator, channel, (block.antenna1, block.antenna2), block.data, weight, weights, centre)
+        weights = mueller_weights(problem, grid, weight[:, 0], self.amplification, centre, known)
+        seen = Channel(operator, channel, (block.antenna1, block.antenna2), block.data, weight, weights, centre, known)
         if self.way == "joint":
             if self.mask is None or self.mask.shape != grid.pixels or not (self.mask & weights.usable).any():
                 raise InputError(
@@ -179,14 +181,19 @@ class BeamImager(SolvingImager):
             found = normalised(seen)
         found.record["condition"] = float(np.max(weights.condition[weights.usable]))
         found.record["without_data"] = float(np.mean(~weights.usable))
+        if len(weights.stokes) < len(STOKES):
+            found.record["stokes"] = "".join("IQUV"[s] for s in weights.stokes)
         return found, self._psf(seen), weights.maps
 
     def _psf(self, seen: Channel) -> Float:
-        """What a point of 1 Jy in I at the centre becomes in I, without any correction but for its own matrix."""
-        point = np.zeros((4, self.pixels, self.pixels))
+        """What a point of 1 Jy in I at the centre becomes in I, without any correction but for its own matrix.
+
+        In the first of I, Q, U, V that is seen.
+        """
+        point, first = np.zeros((4, self.pixels, self.pixels)), seen.weights.stokes[0]
         middle = self.pixels // 2
-        point[0, middle, middle] = 1.0
-        image = seen.back(seen.seen(point), (0,))[0]
+        point[first, middle, middle] = 1.0
+        image = seen.back(seen.seen(point), (first,))[first]
         return np.asarray(image / image[middle, middle])
 
     def _plain(self, block: Visibilities, grid: ImageGrid) -> ImageOperator:
@@ -202,9 +209,19 @@ def _channel_of(given: Visibilities | VisibilityFile, channel: int) -> Visibilit
     return given.block(EVERY, one) if isinstance(given, Visibilities) else Visibilities.of(given.store, EVERY, one)
 
 
-def _without_centre(block: Visibilities, beams: Chain) -> tuple[Visibilities, Any]:
-    """Visibilities without the beam towards their phase centre, and what took it out (T, 1, A, 2, 2)."""
-    if not beams.terms:
+def _known(block: Visibilities) -> Any:
+    """Which correlations any visibility of a channel has, bool (2, 2)."""
+    weight = block.effective_weight
+    found = (weight > 0).any(axis=(0, 1, 2)) if weight.ndim == correlations.APART else correlations.ALL_FOUR
+    return found if found.any() else correlations.ALL_FOUR
+
+
+def _without_centre(block: Visibilities, beams: Chain, known: Any) -> tuple[Visibilities, Any]:
+    """Visibilities without the beam towards their phase centre, and what took it out (T, 1, A, 2, 2).
+
+    As they are where correlations are missing, of which every one without the beam is made.
+    """
+    if not beams.terms or (not known.all() and block.beam_state.removed != "centre"):
         return block, None
     state = block.beam_state
     if state.removed == "centre" and (state.other or state.towards != block.phase_centre):

@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from instrument import mat2
+from instrument.correlations import ALL_FOUR
+from instrument.errors import RefusedError
 from instrument.image.beam_weights import MuellerWeights
 from instrument.predict.base import EVERY
 from instrument.predict.operator import STOKES, ImageOperator
 from instrument.units import Bool, Complex, Float, Int
 
 Q_AND_U = (1, 2)
+CORRELATIONS = ("pp", "pq", "qp", "qq")
 
 
 @dataclass(frozen=True)
 class Channel:
     """Visibilities (T, 1, B, 2, 2) with weights (T, 1, B), and the operator that takes images to them.
 
-    `centre` (T, 1, A, 2, 2) is what took the beam towards the phase centre out of the data; the operator is taken
-    through it too: with beams as they are, the sidelobes of a source would be polarized as the dipoles lie.
+    `known` (2, 2) are the correlations that have these weights, the others none. `centre` (T, 1, A, 2, 2) is what took
+    the beam towards the phase centre out of the data; the operator is taken through it too: with beams as they are, the
+    sidelobes of a source would be polarized as the dipoles lie.
     """
 
     operator: ImageOperator
@@ -31,6 +35,13 @@ class Channel:
     weight: Float
     weights: MuellerWeights
     centre: Complex | None = None
+    known: Bool = field(default_factory=lambda: ALL_FOUR)
+
+    @property
+    def each(self) -> Float:
+        """Weights of the correlations, (T, 1, B, 2, 2), or (T, 1, B, 1, 1) where all have one."""
+        weight = self.weight[..., None, None]
+        return weight if self.known.all() else weight * self.known
 
     def seen(self, images: Float) -> Complex:
         """A x of images (4, Ny, Nx)."""
@@ -42,7 +53,7 @@ class Channel:
 
     def back(self, data: Complex, kinds: tuple[int, ...] = STOKES) -> Float:
         """A^H w y, (4, Ny, Nx), of some Stokes parameters; 0 of the others."""
-        weight = self.weight[..., None, None]
+        weight = self.each
         weighted = np.asarray(weight * np.where(weight > 0, data, 0), complex)
         if self.centre is not None:
             one, other = (mat2.herm(self.centre[:, :, p]) for p in self.pairs)
@@ -51,8 +62,8 @@ class Channel:
 
     def size(self, data: Complex) -> float:
         """sqrt(sum w |V|^2)."""
-        known = np.where(self.weight[..., None, None] > 0, data, 0.0)
-        return float(np.sqrt(np.sum(self.weight[..., None, None] * np.abs(known) ** 2)))
+        weight = self.each
+        return float(np.sqrt(np.sum(weight * np.abs(np.where(weight > 0, data, 0.0)) ** 2)))
 
 
 @dataclass(frozen=True)
@@ -75,17 +86,10 @@ def joint(seen: Channel, mask: Bool, iterations: int, least: float) -> Corrected
     The images are what is left, normalised; the model is in Jy/pixel. Ends when the residual is `least` of the data.
     """
     mask = mask & seen.weights.usable
-    matrices = seen.weights.matrices[mask]
-
-    def scale(images: Float) -> Float:
-        out = np.zeros_like(images)
-        out[:, mask] = np.linalg.solve(matrices, images[:, mask].T[..., None])[..., 0].T
-        return out
-
     model = np.zeros((4, *mask.shape))
     left, whole = seen.data.copy(), seen.size(seen.data)
     r = np.where(mask, seen.back(left), 0.0)
-    z = scale(r)
+    z = seen.weights.solved(r, mask)
     p, rz, done, share = z, float(np.vdot(r, z)), 0, 1.0
     while done < iterations and rz > 0 and share > least:
         q = seen.seen(p)
@@ -94,7 +98,7 @@ def joint(seen: Channel, mask: Bool, iterations: int, least: float) -> Corrected
         left -= step * q
         share = seen.size(left) / whole
         r = np.where(mask, seen.back(left), 0.0)
-        z = scale(r)
+        z = seen.weights.solved(r, mask)
         rz, before = float(np.vdot(r, z)), rz
         p = z + rz / before * p
         done += 1
@@ -113,7 +117,12 @@ def predicted(seen: Channel, iterations: int, least: float) -> Corrected:
 
     The images have I and V of what is left, and Q and U as they were seen; all normalised.
     """
-
+    if not seen.known.all():
+        there = [name for name, one in zip(CORRELATIONS, seen.known.flat, strict=True) if one]
+        raise RefusedError(
+            f"way = 'predict' needs all four correlations, and a channel has {', '.join(there)} alone: flag that "
+            "channel, or take way = 'normalised' or 'joint'"
+        )
     model = np.zeros((4, *seen.weights.usable.shape))
     wanted = linear(seen.data)
     left, whole = seen.data.copy(), seen.size(wanted)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -61,7 +62,8 @@ HOLDS = {
 def contests_of(what: str, plugins: tuple[str, ...] = (), form: Form = FULL) -> list[Contest]:
     """The contests of WHAT: a scene, a stage, a kind of plugin, or a plugin, beside all others of its kind.
 
-    With `plugins` of these alone. Raises `InputError` where WHAT is nothing, two things, or has no contest yet.
+    Of a plugin those that it takes part in; with `plugins` of these alone. Raises `InputError` where WHAT is nothing,
+    two things, or has no contest yet.
     """
     from instrument.pipeline.scene_text import shipped
 
@@ -89,9 +91,15 @@ def contests_of(what: str, plugins: tuple[str, ...] = (), form: Form = FULL) -> 
             raise InputError(f"--plugins {','.join(plugins)}: the contest of {what} is of settings, leave it out")
         return OF_STAGE[what](form)
     if kinds:
-        return OF_KIND[kinds[0]](_chosen(kinds[0], plugins), form)
+        every = OF_KIND[kinds[0]](_chosen(kinds[0], plugins), form)
+        return every if what in OF_KIND else _with(what, every)
     chosen = _chosen("engines", plugins)
     return [*engines.contests_of_scene(what, chosen, form), *runs.contests_of_scene(what, chosen, form)]
+
+
+def _with(what: str, contests: list[Contest]) -> list[Contest]:
+    """Those in which a plugin takes part: entries are "plugin", "plugin, way" or "plugin (knob)"; else all of them."""
+    return [c for c in contests if any(re.split(r",| \(", e.plugin)[0] == what for e in c.entries)] or contests
 
 
 def _chosen(kind: str, names: tuple[str, ...]) -> dict[str, Any]:

@@ -7,8 +7,13 @@ from typing import Any
 import numpy as np
 
 from instrument.errors import InputError, RefusedError
+from instrument.pipeline.scene_file import parse
+from instrument.pipeline.scene_text import read_tables
+from instrument.precision import diffuse
 from instrument.precision.contest import Contest, Entry, Form, Trial
+from instrument.precision.diffuse import DEFINITION
 from instrument.precision.truth import visibilities
+from instrument.registry import load
 from instrument.scene import Scene
 from instrument.units import Complex
 
@@ -18,15 +23,14 @@ SHORT = tuple(10.0**-k for k in range(2, 13))
 
 
 def contests(engines: dict[str, Any], form: Form) -> list[Contest]:
-    """One a scene that is shipped and has a list of sources as its sky: here the grid of the mock observation."""
-    return contests_of_scene("mock-grid", engines, form)
+    """Of every engine on a sky that it takes: the grid of sources of the mock observation, and diffuse skies."""
+    points = parse(read_tables("mock-grid")).scene().plan(engine=DEFINITION).problem
+    fit = {name: cls for name, cls in engines.items() if load("engines", name).refuses(points) is None}
+    return [*(contests_of_scene("mock-grid", fit, form) if fit else ()), *diffuse.contests(engines, form)]
 
 
 def contests_of_scene(name: str, engines: dict[str, Any], form: Form) -> list[Contest]:
     """The contest on the first stations, the middle times and the first channels of a scene."""
-    from instrument.pipeline.scene_file import parse
-    from instrument.pipeline.scene_text import read_tables
-
     scene = _few_times(parse(read_tables(name)).scene())
     full = scene.plan().full
     if full.sky.kind != "points":
@@ -35,7 +39,9 @@ def contests_of_scene(name: str, engines: dict[str, Any], form: Form) -> list[Co
     chosen = np.flatnonzero((full.antenna1 < STATIONS) & (full.antenna2 < STATIONS))
     truth = visibilities(full.between(full.antenna1[chosen], full.antenna2[chosen]))
     scale = float(np.max(scene.plan().scale_jy))
-    entries = tuple(Entry(engine, _answer(scene, engine, chosen)) for engine in engines)
+    # the definition sums whatever is asked for, and slowly
+    once = SHORT[:2] if form.quick else ()
+    entries = tuple(Entry(e, _answer(scene, e, chosen), once if e == DEFINITION else ()) for e in engines)
 
     def judge(found: Complex, asked: float) -> Trial:
         apart = (found - truth) / scale

@@ -269,8 +269,11 @@ def _chosen(products: Complex, wanted: float) -> list[tuple[Int, Float]]:
 
 def _measured(nodes: BeamNodes, due: Complex, at_nodes: Complex, places: Float) -> BeamNodes:
     """The same with the largest error of products (N, 16, S) at some places, made of those at the nodes (N, 16, K)."""
-    wrong = at_nodes @ nodes.at(places) - due
+    # one product of two matrices, and not N of stacked ones, which are no BLAS: 10 times as quick
+    made = at_nodes.reshape(-1, len(nodes)) @ nodes.at(places).astype(complex)
+    wrong = made.reshape(due.shape) - due
     error = float(np.linalg.norm(wrong, axis=1).max())
-    stokes = np.einsum("ai,nijs,jb->nabs", TO_STOKES, wrong.reshape(-1, 4, 4, wrong.shape[-1]), 2 * TO_STOKES.conj().T)
+    mueller = wrong.reshape(-1, 4, 4, wrong.shape[-1])
+    stokes = np.einsum("ai,nijs,jb->nabs", TO_STOKES, mueller, 2 * TO_STOKES.conj().T, optimize=True)
     parts = np.linalg.norm(stokes[:, 0, 1:], axis=1), np.linalg.norm(stokes[:, 1:, 0], axis=1)
     return replace(nodes, error=SAFETY * error, leakage=SAFETY * float(np.maximum(*parts).max()))

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from instrument.errors import RefusedError
 from instrument.jones.base import JonesTerm
 from instrument.jones.chain import Chain
 from instrument.model import Composed
@@ -20,7 +21,8 @@ from instrument.observe.directions import LIGHT, EarthFrame
 from instrument.observe.layout import Layout
 from instrument.observe.observation import Observation
 from instrument.observe.sampling import Sampling
-from instrument.predict.base import EVERY, Predictor, Problem
+from instrument.predict.base import EVERY, Predictor, Prepared, Problem
+from instrument.predict.operator import ImageOperator
 from instrument.scene import Scene
 from instrument.sky.points import PointSky
 from instrument.stress.case import Unfit
@@ -30,6 +32,7 @@ from instrument.visibilities import Visibilities
 CENTRE = Direction(0.0, 0.0)  # ITRF x: the w axis, and the zenith of the stations
 AXES = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])  # p, q, r are u, v, w
 GROUND = 6.4e6
+TOLERANCES = (0.0, 1e-9, 1e-6, 1e-3)  # that an engine is asked for, one after the other
 
 
 @cache
@@ -81,12 +84,33 @@ def problem(uvw_m: Any, sky: PointSky, *terms: JonesTerm, freq_hz: Any = LIGHT) 
     return Problem(at, Chain(*terms), sky, a, b, interval_s=10.0, width_hz=1e5)
 
 
-def sums(engine: Predictor, given: Problem) -> Complex:
-    """What an engine makes of a problem at tolerance 0, (T, F, B, 2, 2)."""
-    why = engine.refuses(given)
-    if why:
+def ready(engine: Predictor, given: Problem) -> Prepared:
+    """An engine made ready for a problem at the least tolerance that it takes: 0, or one above it if it approximates.
+
+    Raises `Unfit` with its reason where it refuses the problem, or all tolerances.
+    """
+    if why := engine.refuses(given):
         raise Unfit(why)
-    return engine.prepare(given, 0.0).sums(EVERY, EVERY)
+    said: Exception | None = None
+    for tolerance in TOLERANCES:
+        try:
+            return engine.prepare(given, tolerance)
+        except RefusedError as error:
+            said = error
+    raise Unfit(str(said))
+
+
+def operator(engine: Predictor, given: Problem) -> ImageOperator:
+    """The same of a problem with an image; raises `Unfit` where the engine has no adjoint."""
+    found = ready(engine, given)
+    if not isinstance(found, ImageOperator):
+        raise Unfit("it has no adjoint")
+    return found
+
+
+def sums(engine: Predictor, given: Problem) -> Complex:
+    """What an engine makes of a problem as well as it can, (T, F, B, 2, 2)."""
+    return ready(engine, given).sums(EVERY, EVERY)
 
 
 def fringe(cycles: Any) -> Complex:

@@ -14,10 +14,9 @@ from instrument.jones.feed import FeedTerm
 from instrument.jones.gain import GainTerm
 from instrument.observe.grid import ImageGrid
 from instrument.predict.base import EVERY, Predictor, Problem
-from instrument.predict.operator import ImageOperator
 from instrument.sky.image import ImageSky
-from instrument.stress.bench import fringe, points, problem, references, sums
-from instrument.stress.case import Answer, Unfit, both, case, claim, held, not_there
+from instrument.stress.bench import fringe, operator, points, problem, references, sums
+from instrument.stress.case import Answer, both, case, claim, held, not_there
 from instrument.units import Complex
 
 JY = (1.0, 0.0, 0.0, 0.0)
@@ -188,9 +187,7 @@ def one_place(engine: Predictor) -> Answer:
 def adjoint(engine: Predictor) -> Answer:
     """For the engines that have an adjoint; y is A x and as much noise."""
     given = problems()["an image, phased stations"]
-    ready = engine.prepare(given, 0.0) if engine.refuses(given) is None else None
-    if not isinstance(ready, ImageOperator):
-        raise Unfit("it takes no images, or has no adjoint")
+    ready = operator(engine, given)
     shape = (given.shape[1], 4, *ready.sky.grid.pixels)
     impulse, nyquist = np.zeros(shape), np.ones(shape)
     impulse[0, 1, 0, -1] = 1.0
@@ -217,9 +214,7 @@ def adjoint_in_pieces(engine: Predictor) -> Answer:
     grid = ImageGrid.of(shape, 2e-3, given.at.centre)
     sky = ImageSky(grid=grid, stokes=x, frequencies=given.at.freq_hz * u.Hz)
     given = replace(given, sky=sky, antenna1=given.antenna1[:2], antenna2=given.antenna2[:2])
-    ready = engine.prepare(given, 0.0) if engine.refuses(given) is None else None
-    if not isinstance(ready, ImageOperator):
-        raise Unfit("it takes no images, or has no adjoint")
+    ready = operator(engine, given)
     ax = ready.forward(x, EVERY, EVERY)
     y = ax + np.random.default_rng(6).normal(size=(*ax.shape, 2)).view(complex)[..., 0]
     off = abs(float(np.vdot(y, ax).real) - float(np.vdot(x, ready.adjoint(y, EVERY, EVERY))))

@@ -19,9 +19,9 @@ from instrument.model import Instrument
 from instrument.observe.layout import Layout
 from instrument.observe.sampling import Sampling
 from instrument.precision import truth
-from instrument.predict.base import Predictor, Problem
+from instrument.predict.base import EVERY, Predictor, Problem
 from instrument.sky.points import PointSky
-from instrument.stress.bench import small_array, sums, towards
+from instrument.stress.bench import ready, small_array, sums, towards
 from instrument.stress.case import Answer, Unfit, both, case, claim, held
 from instrument.units import Complex, Direction
 
@@ -127,7 +127,7 @@ def chains(engine: Predictor) -> Answer:
     return both(*(held(sums(engine, g), due, 1e-11, scale=float(np.abs(due).max())) for g, due in _chains()))
 
 
-@case("X2", "engines", "an image of pixels", "the sums of its pixels as points, to 1e-11")
+@case("X2", "engines", "an image of pixels", "the sums of its pixels as points, to 1e-11, or to the bound given")
 def pixels(engine: Predictor) -> Answer:
     """5 x 4 pixels in 3 channels, through phased stations."""
     from astropy import units as u
@@ -146,7 +146,9 @@ def pixels(engine: Predictor) -> Answer:
     whole = PointSky(names=names, ra_rad=ra, dec_rad=dec, stokes_jy=flat[0])
     given = _given(whole, *RECEIVERS, _station(), Parallactic())
     given = replace(given, sky=image, at=given.at.towards(*image.outline()))
-    found = sums(engine, given)
+    prepared = ready(engine, given)
+    found = prepared.sums(EVERY, EVERY)
+    flux = float(image.total_jy(freq).max())
     # where pixels stand: x runs to the west, the centre is pixel (2, 2)
     x, y = np.meshgrid(-0.02 * (np.arange(4) - 2), 0.02 * (np.arange(5) - 2))
     g = truth.geometry(given.at.towards(ra, dec))
@@ -155,7 +157,8 @@ def pixels(engine: Predictor) -> Answer:
         sky = whole.with_fields(stokes_jy=flat[f])
         one = replace(_given(sky, *RECEIVERS, _station(), Parallactic()))
         due = truth.visibilities(one.block(slice(None), slice(f, f + 1))).astype(complex)
-        answers.append(held(found[:, f : f + 1], due, 1e-11))
+        limit = 1e-11 + prepared.bound * flux / np.abs(due).max()
+        answers.append(held(found[:, f : f + 1], due, limit))
     return both(*answers)
 
 

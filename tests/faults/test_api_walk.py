@@ -194,7 +194,8 @@ def calls():
         ("read_frequencies", ins.read_frequencies, {"path": "none.txt"}),
         ("read_psf", ins.read_psf, {"path": "none.fits", "cube": w.cube}),
         ("recovered_power", ins.recovered_power, {
-            "recovered": w.cube, "injected": w.cube, "noise": w.cube, "bins": 4, "bins_par": 3}),
+            "recovered": w.cube, "injected": w.cube, "noise": w.cube, "bins": 4, "bins_par": 3,
+            "shape": "cylindrical"}),
         ("Recovered.write", w.recovered.write, {"path": "recovered.ecsv"}),
         ("SignalLoss.within", w.loss.within, {"k_par": (0.0, 1.0), "k_perp": (0.0, 9.0)}),
         ("Separation.nothing", ins.Separation.nothing, {

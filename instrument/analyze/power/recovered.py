@@ -14,6 +14,7 @@ from instrument.analyze.power.transform import Transform, cells_of
 from instrument.checked import checked
 from instrument.errors import InputError
 from instrument.image.cube import StokesCube
+from instrument.numbers import brief
 from instrument.shown import short_repr
 from instrument.units import Float
 from instrument.whole_file import write_ecsv
@@ -106,8 +107,11 @@ def recovered_power(
 
     `injected` is the signal as the same instrument and imager show it alone, so that the PSF is in both; `noise` a cube
     of noise alone, whose power is taken off. All on the same axes and in one unit. A pixel without data in one counts
-    in none. `how` is the transform of `Analyzer.cells`, `bins` and `bins_par` are those of its spectra.
+    in none. `how` is the transform of `Analyzer.cells`, `bins` and `bins_par` are those of its spectra, the latter of
+    "cylindrical" ones alone.
     """
+    if bins_par is not None and shape == "spherical":
+        raise InputError(f"bins_par = {brief(bins_par)} is of shape = 'cylindrical': say so, or leave it out")
     cubes = [recovered, injected, *(() if noise is None else (noise,))]
     for cube in cubes[1:]:
         if cube.unit != recovered.unit:

@@ -13,6 +13,7 @@ from instrument.checked import checked
 from instrument.errors import InputError
 from instrument.image.common_beam import shapes
 from instrument.image.cube import StokesCube
+from instrument.numbers import Index, Whole
 from instrument.observe.directions import tangents
 from instrument.shown import short_repr
 from instrument.sky.bbs import write_bbs
@@ -73,10 +74,11 @@ class SourceCatalogue:
         """s0001, s0002 ..., brightest first."""
         return tuple(f"s{k + 1:04d}" for k in range(len(self)))
 
-    def sky(self, channel: int = 0) -> PointSky:
+    def sky(self, channel: Index = 0) -> PointSky:
         """A sky of these sources, with their fluxes in one channel: to predict, to subtract, to be measured again."""
         if not len(self):
             raise InputError("no source was found: there is no sky of them")
+        channel = Whole(at_least=0, at_most=len(self.freq_hz) - 1).check(channel, "channel")
         shaped = {"major_rad": self.major_rad, "minor_rad": self.minor_rad, "angle_rad": self.angle_rad}
         return PointSky(
             names=self.names,
