@@ -85,18 +85,19 @@ def test_many_directions_leaves_the_noise_and_one_direction_more(tmp_path, capsy
 
 @pytest.mark.long
 def test_faraday_leakage_goes_all_the_way_to_the_window(tmp_path):
-    """A sky without I: what is seen in I has leaked, 0.28 % of P within a factor 2 (the paper: 0.2 to 0.3 %)."""
+    """A sky without I: what is seen in I has leaked, 0.22 % of P within a factor 2 (the paper: 0.2 to 0.3 %)."""
     status, folder, record = ran(
         tmp_path, "faraday-leakage", "observation.interval='2 h'", "observation.frequency.channel_width='1 MHz'",
-        "observation.frequency.channels=32", "image.pixels=80", "image.pixel='3 arcmin'", "image.uv_range=[30,300]",
-        "analyze.cube.uv_range=[30,300]", "sky.count=60", "analyze.cube.depths=[-10,10,0.5]",
+        "observation.frequency.channels=32", "sky.pixels=64", "sky.pixel='4 arcmin'", "image.pixels=64",
+        "image.pixel='4 arcmin'", "image.uv_range=[30,300]", "analyze.cube.uv_range=[30,300]",
+        "analyze.cube.depths=[-10,10,0.5]",
     )  # fmt: skip
     assert status == 0
     p, i = (QTable.read(folder / f"spectrum_spherical_{name}.ecsv") for name in "PI")
     use = p["count"] > 0
     share = np.sqrt(i["power"][use] / p["power"][use])
-    assert np.all((share > 1e-3) & (share < 0.02))
-    assert 0.0014 < np.median(share) < 0.0056
+    assert np.all((share > 1e-3) & (share < 0.01))
+    assert 0.0014 < np.median(share) < 0.0044
     window = QTable.read(folder / "window.ecsv")
     assert window["open"].any() and window.meta["model"] == "21cmFAST_2011_z9.50"
     assert {"Faraday depth", "power spectrum of I", "prediction"} <= set(record["checks"])
