@@ -120,31 +120,43 @@ class Solution:
 
     @classmethod
     def joined(cls, parts: Sequence[Solution]) -> Solution:
-        """Solutions of blocks as one: blocks of the same channels, in order of time."""
+        """Solutions of blocks as one: blocks in order of time, and those of one time in order of channels."""
+        rows: dict[bytes, list[Solution]] = {}
+        for part in parts:
+            rows.setdefault(np.asarray(part.term.slots_s).tobytes(), []).append(part)
+        return cls._side_by_side([cls._side_by_side(row, 1) for row in rows.values()], 0)
+
+    @classmethod
+    def _side_by_side(cls, parts: Sequence[Solution], axis: int) -> Solution:
+        """Solutions of blocks that follow each other in time (0) or in channels (1)."""
+        if len(parts) == 1:
+            return parts[0]
+        name = ("slots_s", "freq_hz")[axis]
         tables = [p.term for p in parts]
         longest = max(len(p.history) for p in parts)
         history = np.stack([np.pad(p.history, (0, longest - len(p.history))) for p in parts]).max(axis=0)
-        values, slots = (np.concatenate([getattr(t, k) for t in tables]) for k in ("values", "slots_s"))
+        values = np.concatenate([t.values for t in tables], axis)
+        places = np.concatenate([getattr(t, name) for t in tables])
         gauge = min((p.gauge for p in parts), key=lambda g: g.count)
-        first = np.cumsum([0, *(len(p.outcome) for p in parts)])
+        first = np.outer(np.cumsum([0, *(p.outcome.shape[axis] for p in parts)]), np.eye(2, dtype=int)[axis])
         return cls(
-            term=tables[0].with_fields(values=values, slots_s=slots),
-            outcome=np.concatenate([p.outcome for p in parts]),
-            iterations=np.concatenate([p.iterations for p in parts]),
-            residual=np.concatenate([p.residual for p in parts]),
+            term=tables[0].with_fields(values=values, **{name: places}),
+            outcome=np.concatenate([p.outcome for p in parts], axis),
+            iterations=np.concatenate([p.iterations for p in parts], axis),
+            residual=np.concatenate([p.residual for p in parts], axis),
             gauge=gauge,
             history=history,
             interval_s=parts[0].interval_s,
             looser={
-                (int(t) + k, f): p.looser.get((k, f), p.gauge)
-                for t, p in zip(first, parts, strict=False)
+                (int(t) + k, int(c) + f): p.looser.get((k, f), p.gauge)
+                for (t, c), p in zip(first, parts, strict=False)
                 for k, f in (np.ndindex(p.outcome.shape) if p.gauge.count > gauge.count else p.looser)
             },
             spoilt=sum((Counter(p.spoilt) for p in parts), Counter()),
-            unexplained=np.concatenate([np.broadcast_to(p.unexplained, p.outcome.shape) for p in parts]),
+            unexplained=np.concatenate([np.broadcast_to(p.unexplained, p.outcome.shape) for p in parts], axis),
             notes=tuple(dict.fromkeys(text for p in parts for text in p.notes)),
-            error=_along([p.error for p in parts], [p.jones.shape for p in parts]),
-            common_error=_along([p.common_error for p in parts], [(*p.outcome.shape, 0) for p in parts]),
+            error=_along([p.error for p in parts], [p.jones.shape for p in parts], axis),
+            common_error=_along([p.common_error for p in parts], [(*p.outcome.shape, 0) for p in parts], axis),
         )
 
     def __str__(self) -> str:
@@ -165,7 +177,7 @@ class Solution:
         )
 
 
-def _along(given: Sequence[Float], shapes: Sequence[tuple[int, ...]]) -> Float:
+def _along(given: Sequence[Float], shapes: Sequence[tuple[int, ...]], axis: int) -> Float:
     """Errors of blocks as one, each of its shape or of length 1 where constant; the last axis is the longest."""
     if all(np.isnan(x).all() for x in given):
         return given[0]
@@ -174,7 +186,7 @@ def _along(given: Sequence[Float], shapes: Sequence[tuple[int, ...]]) -> Float:
     for x, shape in zip(given, shapes, strict=True):
         longer = np.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, last - x.shape[-1])], constant_values=np.nan)
         parts.append(np.broadcast_to(longer, (*shape[:-1], last)))
-    return np.concatenate(parts)
+    return np.concatenate(parts, axis)
 
 
 @checked

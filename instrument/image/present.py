@@ -20,6 +20,11 @@ def has_beam(cube: StokesCube) -> bool:
     return all(has or not np.isfinite(planes).any() for has, planes in zip(known, cube.data, strict=True))
 
 
+def in_kelvin(cube: StokesCube) -> StokesCube:
+    """The cube in K where the beam is known, or none is needed; as it is elsewhere."""
+    return cube.to_kelvin() if cube.unit == "Jy/pixel" or has_beam(cube) else cube
+
+
 def middle_channel(cube: StokesCube, stokes: str) -> int:
     """The middle one of the channels that have data."""
     plane = cube.data[:, "IQUV".index(stokes)]

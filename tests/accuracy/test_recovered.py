@@ -1,10 +1,12 @@
 """A 21-cm signal and foregrounds in one scene, and what of the power injected is there at the end of the way."""
 
+import copy
 import warnings
 
 import numpy as np
 import pytest
 from astropy import units as u
+from astropy.table import QTable
 
 import instrument
 from instrument import (
@@ -21,6 +23,9 @@ from instrument import (
     recovered_power,
 )
 from instrument.analyze.power.signal_sky import SignalSky
+from instrument.analyze.power.transform import Transform
+from instrument.pipeline.run import run
+from instrument.pipeline.scene_file import parse
 from instrument.sky.synchrotron import Synchrotron
 from instrument.units import Direction
 
@@ -174,3 +179,92 @@ def test_a_signal_is_recovered_after_beam_calibration_and_removal():
     due = recovered_power(remover.split(injected).residual, injected, bins=4)
     assert np.all(np.abs(after.transfer - due.transfer) < 4 * after.transfer_sigma)
     np.testing.assert_allclose(due.ratio, due.transfer**2 + due.foreign, rtol=1e-9)
+
+
+# As a product of a run -------------------------------------------------------------------------------------------
+
+TABLES = {
+    "name": "way",
+    "seed": 3,
+    "instrument": {
+        "telescope": "lofar-hba", "beam": "none", "gain": {"rms": 0.1},
+        "stations": ["CS001HBA0", "CS001HBA1", "CS002HBA0", "CS003HBA0", "CS004HBA1", "CS005HBA0"],
+    },
+    "observation": {
+        "phase_centre": "08h13m36.0s +48d13m03s", "transit": "2012-12-07", "duration": "8 h", "interval": "2 h",
+        "frequency": {"centre": "146 MHz", "channel_width": "1 MHz", "channels": 8},
+    },
+    "sky": {
+        "kind": "sum",
+        "dust": {"kind": "synchrotron", "pixels": 32, "pixel": "20 arcmin", "rms": "2 mK", "uv_range": [7, 85]},
+        "hydrogen": {
+            "kind": "signal-21cm", "pixels": 32, "pixel": "20 arcmin", "band": ["142.5 MHz", "149.5 MHz"],
+            "channels": 8,
+        },
+    },
+    "image": {"pixels": 32, "pixel": "20 arcmin", "uv_range": [10, 80]},
+    "analyze": {"products": ["recovered"], "cube": {"products": [], "bins": 3, "uv_range": [10, 80]}},
+}  # fmt: skip
+
+
+def ran(tmp_path, **changes):
+    tables = {k: v for k, v in (copy.deepcopy(TABLES) | changes).items() if v is not None}
+    made = run(parse(tables), tables, out=str(tmp_path), force=True)
+    return made, QTable.read(tmp_path / "recovered.ecsv")
+
+
+def test_a_run_compares_its_cube_with_the_signal_of_the_perfect_instrument(tmp_path):
+    """To rounding what `recovered_power` has of the two cubes, which are made here by hand, gains of 10 % and all."""
+    made, table = ran(tmp_path)
+    scene = parse(copy.deepcopy(TABLES)).scene()
+    alone = scene.with_fields(instrument=scene.instrument.perfect(), sky=scene.sky.skies["hydrogen"])
+    imager = Imager(pixels=32, pixel=20 * u.arcmin, uv_range=(10, 80))
+    cubes = [imager.image(one.plan().run()) for one in (scene, alone)]
+    due = recovered_power(*cubes, how=Transform(taper_space="hann", uv_range=(10, 80)), bins=3).table()
+    for name in ("injected", "ratio", "transfer"):
+        np.testing.assert_allclose(table[name].value, due[name].value, rtol=1e-6)
+    assert abs(table["transfer"][-1] - 1) > 1e-3  # gains of 10 % are in it
+    assert set(made.stages["analyze"].record()["recovered"]) == {"with foregrounds"}
+    page = (tmp_path / "report.html").read_text()
+    assert ">Signal recovered<" in page and (tmp_path / "recovered.png").is_file()
+
+
+def test_calibration_brings_the_signal_back_and_noise_is_taken_off(tmp_path):
+    """All of it to 1e-6 without noise and foreground, solved block by block in channels; noise is no power of it."""
+    sky = {"kind": "sum", "hydrogen": TABLES["sky"]["hydrogen"]}
+    _, table = ran(tmp_path / "a", sky=sky, calibrate={"kind": "selfcal", "tolerance": 1e-10}, tolerance=1e-6)
+    np.testing.assert_allclose(table["ratio"], 1, rtol=1e-6)
+    np.testing.assert_allclose(table["transfer"], 1, rtol=1e-6)
+    bare = TABLES["instrument"] | {"gain": {"rms": 0.0}}
+    _, noisy = ran(tmp_path / "b", sky=sky, instrument=bare, noise={"sefd": "2820 Jy", "nights": 1})
+    assert np.all(noisy["foreign"] > 10)  # to which the ratio would be equal; few baselines are few modes
+    assert np.all(np.abs(noisy["ratio"] - 1) < 0.4 * noisy["foreign"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"sky": TABLES["sky"]["dust"]}, "needs a sky that is a sum with one 21-cm signal.*no such member"),
+        ({"analyze": {"products": ["recovered"]}}, "takes its bins and tapers from a table .analyze.cube."),
+        ({"image": TABLES["image"] | {"kind": "clean"}}, "a CLEAN of the signal alone is not that of the signal"),
+    ],
+)
+def test_a_run_that_cannot_tell_is_refused_before_it_begins(tmp_path, changes, said):
+    with pytest.raises(InputError, match=said) as error:
+        ran(tmp_path / "out", **changes)
+    assert "\n" not in str(error.value) and not (tmp_path / "out").exists()
+
+
+def test_solutions_of_blocks_of_channels_are_those_of_the_whole():
+    scene = parse(copy.deepcopy(TABLES)).scene()
+    scene = scene.with_fields(sky=instrument.load("skies", "grid", shape=(2, 2), spacing=2 * u.deg, flux=5 * u.Jy))
+    model = scene.with_fields(instrument=scene.instrument.perfect()).plan().run()
+    data, solver = scene.plan().run(), SelfCal(tolerance=1e-10)
+    cuts = [(slice(t, t + 2), slice(f, min(f + 3, 8))) for t in (0, 2) for f in (0, 3, 6)]
+    parts = [solver.solve(data.block(*cut), model.block(*cut)) for cut in cuts]
+    whole, joined = solver.solve(data, model), instrument.Solution.joined(parts)
+    for name in ("slots_s", "freq_hz"):
+        np.testing.assert_array_equal(getattr(joined.term, name), getattr(whole.term, name))
+    np.testing.assert_allclose(joined.jones, whole.jones, rtol=1e-8)
+    assert (joined.outcome == whole.outcome).all() and joined.error.shape == whole.error.shape
+    np.testing.assert_allclose(joined.residual, whole.residual, atol=1e-9)

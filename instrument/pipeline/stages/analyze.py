@@ -19,6 +19,7 @@ from instrument.pipeline.stages.analyze_work import cube_products, photometry, t
 from instrument.pipeline.stages.cube import CubeAnalysis
 from instrument.pipeline.stages.image import Image, ImageResult
 from instrument.pipeline.stages.leakage import EXPECTED_JONES, LeakageRun, listed
+from instrument.pipeline.stages.recovered import recovered, recovering, signal_of
 from instrument.pipeline.work import Items, StageWork
 from instrument.plan import Item
 from instrument.report.page import Figures, Section, Text
@@ -33,7 +34,7 @@ class Analyze(Stage):
     """What is made of sources and images: products, settings of forced photometry, and the analysis of the cube."""
 
     after: ClassVar[tuple[str, ...]] = ("noise", "calibrate", "correct", "image")
-    products: tuple[Literal["leakage", "spectrum-2d"], ...] = ("leakage",)
+    products: tuple[Literal["leakage", "spectrum-2d", "recovered"], ...] = ("leakage",)
     uv_range: UvRange | None = None
     every: Count = 1
     cube: CubeAnalysis | None = None
@@ -46,6 +47,13 @@ class Analyze(Stage):
             raise InputError("[analyze] products = ['spectrum-2d'] needs images: give a table [image]")
         if found.cube and "image" not in beside.tables:
             raise InputError("[analyze.cube] needs images: give a table [image]")
+        if "recovered" in found.products and found.cube is None:
+            raise InputError("[analyze] products = ['recovered'] takes its bins and tapers from a table [analyze.cube]")
+        if "recovered" in found.products and beside.tables["image"].get("kind") == "clean":
+            raise InputError(
+                "[analyze] products = ['recovered']: a CLEAN of the signal alone is not that of the signal among "
+                "others; take [image] kind = 'dirty' or 'beam'"
+            )
         return found
 
     def ranges(self) -> tuple[tuple[float, float] | None, ...]:
@@ -59,12 +67,18 @@ class Analyze(Stage):
             unused("[analyze]", given, "they are of the product 'leakage'")
         else:
             listed(scene.sky.about(scene.observation.phase_centre))
+        if "recovered" in self.products:
+            signal_of(scene.sky)
         freq = scene.observation.freq_hz
         if self.cube is not None:  # said before the run, not at its end
             check_redshift(self.cube.redshift, float(freq.min()), float(freq.max()))
         asked = [name for name in (self.cube and self.cube.products) or () if name != "spectrum-2d"]
         if asked and freq.size < 2:
             raise InputError(f"[analyze.cube] products = '{asked[0]}': one channel; give more, or take 'spectrum-2d'")
+        if "recovered" in self.products and freq.size < 2:
+            raise InputError(
+                "[analyze] products = ['recovered']: one channel has no spectrum along frequency; give more"
+            )
 
     def work(self, run: Running) -> StageWork:
         """That of its products, one after the other."""
@@ -79,6 +93,8 @@ class Analyze(Stage):
                 )
             if self.cube is not None:
                 parts.append(cube_products(self.cube, channels, pixels))
+            if "recovered" in self.products:
+                parts.append(recovering(run))
         return together(parts)
 
     def items(self, run: Running) -> Items:
@@ -115,6 +131,10 @@ class _AnalyzeRun(StageRun):
             products = self.settings.cube.run(self._images().cube)
             self.run.parts.setdefault(self.run.now, {}).update(products.seconds)
             found.append(products)
+            if "recovered" in self.settings.products:
+                with self.run.timed("signal recovered"):
+                    name = signal_of(self.run.plan.problem.sky)
+                    found.append(recovered(self.run, name, self._images(), products))
         return Several(found)
 
     def _images(self) -> ImageResult:

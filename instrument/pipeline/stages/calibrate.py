@@ -11,7 +11,7 @@ import numpy as np
 
 from instrument.analyze.analyzer import Analyzer
 from instrument.calibrate.base import Calibrator, Solution
-from instrument.calibrate.by_station import rms_by_station
+from instrument.calibrate.by_station import powers_by_station, share_of
 from instrument.calibrate.di_errors import NAMES, DIComparison, DISums
 from instrument.calibrate.newton import lanes_of, normal_bytes
 from instrument.calibrate.selfcal import SelfCal
@@ -111,8 +111,8 @@ class _CalibrateRun(StageRun):
     parts: list[Solution] = field(default_factory=list)
     errors: DISums | None = None
     power: dict[str, float] = field(default_factory=dict)
-    left: list[Float] = field(default_factory=list)  # of the corrected less the model, (T, A) of each block
-    slots_s: list[Float] = field(default_factory=list)
+    # powers of the corrected less the model, and of the model (2, T, A), of the times of blocks
+    left: dict[tuple[float, ...], Float] = field(default_factory=dict)
     put_in: Float = field(default_factory=lambda: np.zeros(3))  # |J - 1|^2 on and off the diagonal, and how many
 
     @property
@@ -147,8 +147,8 @@ class _CalibrateRun(StageRun):
                 part = make()
                 self.power[name] = self.power.get(name, 0.0) + float((np.abs(part.data) ** 2).sum())
                 if name == IMAGES[-1]:
-                    self.left.append(rms_by_station(part, model))
-                    self.slots_s.append(block.at.slots_s)
+                    times = tuple(block.at.slots_s.tolist())  # of which there are blocks of several channels
+                    self.left[times] = self.left.get(times, 0.0) + powers_by_station(part, model)
                 if self.images:
                     self.images[name].add(part.flagged(corrected.flag))
         self.power["model"] = self.power.get("model", 0.0) + float((np.abs(model.data) ** 2).sum())
@@ -164,7 +164,8 @@ class _CalibrateRun(StageRun):
         uv_range = None if image is None else image.imager.uv_range
         rms = {k: float(np.sqrt(v)) for k, v in self.power.items()}
         left = LeftByStation(
-            np.concatenate(self.left), np.concatenate(self.slots_s), self.run.plan.problem.interval_s,
+            share_of(np.concatenate(list(self.left.values()), axis=1)), np.concatenate(list(self.left)),
+            self.run.plan.problem.interval_s,
         )  # fmt: skip
         return CalibrationResult(solution, errors, cubes, rms, uv_range, left)
 

@@ -21,7 +21,7 @@ from instrument.component import Component
 from instrument.errors import InputError, InstrumentWarning, unused, warn
 from instrument.foreground.base import ForegroundRemover
 from instrument.image.cube import StokesCube
-from instrument.image.present import has_beam, middle_channel, stokes_of
+from instrument.image.present import has_beam, in_kelvin, middle_channel, stokes_of
 from instrument.memory import afford, give_back
 from instrument.pipeline.stages.cube_page import CubeResults
 from instrument.registry import load
@@ -229,7 +229,7 @@ class CubeAnalysis(Component):
         progress: Callable[[float], None],
     ) -> None:
         """What is made of temperatures: removal, spectra and the window."""
-        kelvin = cube.to_kelvin() if cube.unit == "Jy/pixel" or has_beam(cube) else cube
+        kelvin = in_kelvin(cube)
         if noise is not None and noise.unit != kelvin.unit:
             noise = noise.to_kelvin()
         if self.remove is not None:
@@ -311,7 +311,14 @@ class CubeAnalysis(Component):
             if {"cylindrical", "spherical"} & set(wanted):
                 with result.timed("3D spectra"):
                     cells = analyzer.cells(
-                        stokes, self.taper, self.taper_space, self.uv_range, None, False, self._infill(), self.redshift
+                        stokes,
+                        self.taper,
+                        self.taper_space,
+                        self.uv_range,
+                        None,
+                        False,
+                        self.infill_time(),
+                        self.redshift,
                     )
                 with result.timed("checks"):
                     check = check_cells(one, cells)
@@ -333,10 +340,11 @@ class CubeAnalysis(Component):
                 result.windows[name] = Analyzer(one).eor_window(
                     Signal21cm.table(self.signal), "I", noise, None if self.wedge is None else self.wedge * u.rad,
                     taper=self.taper, taper_space=self.taper_space, uv_range=self.uv_range, bins=self.bins,
-                    bins_par=10 if len(one.freq_hz) >= 8 else None, infill=self._infill(), redshift=self.redshift,
+                    bins_par=10 if len(one.freq_hz) >= 8 else None, infill=self.infill_time(), redshift=self.redshift,
                 )  # fmt: skip
 
-    def _infill(self) -> Any:
+    def infill_time(self) -> Any:
+        """`infill` as a time."""
         from astropy import units as u
 
         return None if self.infill is None else self.infill * u.s

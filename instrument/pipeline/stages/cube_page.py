@@ -36,7 +36,7 @@ def _cube(result: CubeProducts) -> Section:
         ["pixels", f"{cube.data.shape[3]} x {cube.data.shape[2]} of {60 * np.rad2deg(cube.pixel_rad):.4g}′"],
         ["unit", cube.unit],
     ]
-    if cube.psf is not None:
+    if cube.psf is not None and np.isfinite(cube.psf.major_rad).any():
         major, minor = (60 * np.rad2deg(np.nanmedian(x)) for x in (cube.psf.major_rad, cube.psf.minor_rad))
         rows.append(["beam (median of channels)", f"{major:.3g}′ x {minor:.3g}′"])
     rows += [[f"left out: {name}", why] for name, why in result.left_out.items()]
