@@ -71,10 +71,14 @@ class AnyImager(Component):
     restores: ClassVar[bool] = False  # whether what it gives is more than the sums of visibilities: a CLEAN, say
     planes_held: ClassVar[float] = 10  # images a channel, while it works, and of what it gives: for the plan of a run
     planes_made: ClassVar[float] = 5
-    through_beams: ClassVar[bool] = False  # whether a run gives it the operator of its beams
     pixels: Annotated[int, Field(ge=16, le=32768)]
     pixel: Annotated[Radians, Field(gt=0)]
     uv_range: tuple[float, float] | None = None
+
+    @property
+    def through_beams(self) -> bool:
+        """Whether a run gives it the operator of its beams."""
+        return False
 
     @property
     def operator_tolerance(self) -> float:

@@ -59,7 +59,6 @@ class BeamImager(SolvingImager):
     (`plan.operator`), or sees no beams.
     """
 
-    through_beams: ClassVar[bool] = True
     planes_held: ClassVar[float] = 80  # of one channel: its matrices, the functions of the nodes, the solution
     planes_made: ClassVar[float] = 16  # with model and residual, and five maps in float32
     way: Literal["normalised", "joint", "predict"] = "normalised"
@@ -109,6 +108,11 @@ class BeamImager(SolvingImager):
             "condition": PixelMap(made[:, 4:], cube, "condition number of the Mueller matrix of a pixel"),
         }
         return Imaged(cube, beside, {"beam": [found.record for found, *_ in done]}, maps)
+
+    @property
+    def through_beams(self) -> bool:
+        """It does nothing else."""
+        return True
 
     @property
     def operator_tolerance(self) -> float:

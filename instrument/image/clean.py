@@ -23,14 +23,17 @@ class CleanImager(Cleaning):
 
     `peaks` says where components may be: "each" looks for those of I, of Q and U by their P, and of V by themselves;
     "joint" for those of sqrt(I2 + Q2 + U2 + V2), one list of places for all; "I" for those of I, where all four are
-    taken. Nothing is divided by I. `mask` (N, N) keeps them to where it is true; `negative` = False allows none
-    below 0 in I. With `terms` channels are joined: peaks are looked for in their weighted mean, and components follow a
-    polynomial of so many terms in frequency (as many as channels: any spectrum).
+    taken. Nothing is divided by I. `mask` (N, N) keeps them to where it is true; `auto_mask` to where the residual was
+    above so many times its noise in this major cycle or one before; `negative` = False allows none below 0 in I. With
+    `terms` channels are joined: peaks are looked for in their weighted mean, and components follow a polynomial of so
+    many terms in frequency (as many as channels: any spectrum).
 
     A component is `gain` of a peak. A minor cycle takes `major_gain` of the highest peak, then visibilities are gone
     through anew, up to `cycles` times. It ends at `threshold`, at `sigma` times the noise (1.48 of the median
     |residual|), after `iterations` components, or when the residual rises; which it was is in `imaged(...).record`.
     A visibility counts where all of its correlations are known, unless a channel has none that knows one of them.
+
+    In a run `beams` = True looks through those of the scene, by an operator of `tolerance`.
 
     `backend` "radler" has the minor cycles done by that library, in float32 (extra `radler`).
     """
@@ -48,4 +51,7 @@ class CleanImager(Cleaning):
 
     def error(self) -> str:
         """That of the gridding, of what is not cleaned."""
-        return f"gridding {self.accuracy:.0e} of the mean |V|; what is below the end of CLEAN is not deconvolved"
+        through = f", operator {self.tolerance:.0e} of |V|" if self.beams else ""
+        return (
+            f"gridding {self.accuracy:.0e} of the mean |V|{through}; what is below the end of CLEAN is not deconvolved"
+        )

@@ -10,6 +10,7 @@ from instrument.errors import InputError
 from instrument.image.base import SolvingImager
 from instrument.image.dirty import Imager
 from instrument.image.weights import Weighting
+from instrument.numbers import TOLERANCE
 from instrument.units import ArrayOf, Count, Jansky, Radians
 
 
@@ -27,6 +28,7 @@ class Cleaning(SolvingImager):
     peaks: Literal["each", "joint", "I"] = "each"
     terms: Count | None = None
     mask: Annotated[Any, ArrayOf(bool, (None, None))] | None = None
+    auto_mask: Annotated[float, Field(gt=0)] | None = None
     negative: bool = True
     gain: Annotated[float, Field(gt=0, le=1)] = 0.1
     major_gain: Annotated[float, Field(gt=0, le=1)] = 0.8
@@ -35,6 +37,8 @@ class Cleaning(SolvingImager):
     threshold: Annotated[Jansky, Field(ge=0)] = 0.0
     sigma: Annotated[float, Field(ge=0)] = 3.0
     backend: Literal["own", "radler"] = "own"
+    beams: bool = False
+    tolerance: Annotated[float, TOLERANCE] = 1e-5
 
     @field_validator("gain", "major_gain", mode="before")
     @classmethod
@@ -49,6 +53,11 @@ class Cleaning(SolvingImager):
             raise InputError(f"mask has shape {self.mask.shape}, needed that of the images, {(self.pixels,) * 2}")
         if self.mask is not None and not self.mask.any():
             raise InputError("mask is false everywhere: no component could be anywhere, take kind = 'dirty'")
+        if self.auto_mask is not None and self.auto_mask <= self.sigma:
+            raise InputError(
+                f"auto_mask = {self.auto_mask:g} is not above sigma = {self.sigma:g}: nothing would be left to clean "
+                "within it; lower sigma"
+            )
         if self.scales and self.algorithm != "multiscale":
             raise InputError("scales are of algorithm = 'multiscale': say so, or leave them out")
         if self.scales and max(self.scales) > self.pixels * self.pixel:
@@ -56,6 +65,21 @@ class Cleaning(SolvingImager):
                 f"scales: {max(self.scales):.4g} rad is wider than the images, {self.pixels * self.pixel:.4g}"
             )
         return self
+
+    @property
+    def through_beams(self) -> bool:
+        """Where it was asked for."""
+        return self.beams
+
+    @property
+    def operator_tolerance(self) -> float:
+        """As it was asked for."""
+        return self.tolerance
+
+    @property
+    def operator_passes(self) -> float:
+        """The model of each cycle, at most."""
+        return float(self.cycles) if self.beams else 0.0
 
     @property
     def passes(self) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -28,12 +28,16 @@ RISEN = 1.5  # of its lowest: a peak after a major cycle that tells a divergence
 
 @dataclass
 class Hunt:
-    """Components of some Stokes parameters (K,) in some channels (F,), and how that ended."""
+    """Components of some Stokes parameters (K,) in some channels (F,), and how that ended.
+
+    `allowed` (N, N) is where they may be at all; with a mask that grows, that of `search` is a part of it.
+    """
 
     stokes: Int
     channels: Int
     lobes: Lobes
     search: Search
+    allowed: Bool
     done: int = 0
     ended: str = ""
     peak: float = np.inf
@@ -54,8 +58,11 @@ class Hunt:
     def look(self, residual: Float, imager: Cleaning) -> float:
         """The level at which it ends, after a look at the residual; says whether it has."""
         mine = self.of(residual)
+        self.noise = sigma_of(mine, self.search.share, self.allowed)
+        if imager.auto_mask is not None:
+            high = replace(self.search, mask=self.allowed).height(mine) > imager.auto_mask * self.noise
+            self.search = replace(self.search, mask=self.search.mask | high if self.first else high)
         self.peak = float(self.search.height(mine).max())
-        self.noise = sigma_of(mine, self.search.share, self.search.mask)
         self.first = self.first or self.peak
         stop = max(imager.threshold, imager.sigma * self.noise)
         if self.peak <= ROUNDING * self.first:
@@ -79,6 +86,7 @@ class Hunt:
             "major_cycles": self.cycles,
             "peak_jy": self.peak,
             "noise_jy": self.noise,
+            "mask": float(self.search.mask.mean()),
         }
 
 
@@ -157,7 +165,7 @@ class Cycles:
                 if imager.peaks == "I":
                     share = share * (stokes == 0)[:, None]
                 negative = imager.negative or group != (0,)
-                found.append(Hunt(stokes, channels, lobes, Search(share, fit, imager.gain, mask, negative)))
+                found.append(Hunt(stokes, channels, lobes, Search(share, fit, imager.gain, mask, negative), mask))
         return found
 
     def _scales(self, beam_rad: float) -> tuple[float, ...]:

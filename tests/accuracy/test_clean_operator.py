@@ -7,7 +7,10 @@ import pytest
 from astropy import units as u
 
 import instrument
-from instrument import CleanImager, ImageGrid, ImageSky, InputError, Observation, Scene
+from instrument import CleanImager, ImageGrid, ImageSky, InputError, Observation, Scene, read_cube
+from instrument.pipeline.run import run
+from instrument.pipeline.scene_file import parse
+from instrument.pipeline.scene_text import override, read_tables
 
 PIXELS, PIXEL = 24, 8 * u.arcmin
 SOURCES = {(15, 6): (10, 0, 0, 0), (5, 17): (5, 0, 0, 0), (18, 18): (3, 0.5, -0.2, 0.1)}
@@ -52,3 +55,36 @@ def test_an_operator_of_other_images_times_or_stations_is_refused_in_one_line(pl
     with pytest.raises(InputError, match="has not the channels") as error:
         IMAGER.image(moved, plan.ready)
     assert "\n" not in str(error.value)
+
+
+SCENE = [
+    f"instrument.stations={[f'CS{k:03d}HBA{ear}' for k in range(2, 8) for ear in (0, 1)]}",
+    "observation.interval='40 min'", "sky.shape=[3,1]", "sky.spacing='48 arcmin'",
+]  # fmt: skip
+CLEANED = {
+    "kind": "clean", "beams": True, "tolerance": 1e-3, "pixels": 24, "pixel": "8 arcmin", "uv_range": [20, 200],
+    "peaks": "joint", "cycles": 10, "threshold": "1 mJy", "sigma": 0,
+}  # fmt: skip
+
+
+def test_a_scene_file_cleans_through_the_beams(tmp_path):
+    """Three unpolarized sources on pixels: 10 Jy before the beams in each, and 1e-4 of I left of 1 % that leaks."""
+    at = np.ix_((12,), (6, 12, 18))
+    polarized = {}
+    for beams in (True, False):
+        tables = override(read_tables("aw-correction"), SCENE)
+        tables["image"] = {k: v for k, v in CLEANED.items() if beams or k not in ("beams", "tolerance")}
+        result = run(parse(tables), tables, out=str(tmp_path / str(beams)))
+        images = read_cube(tmp_path / str(beams) / "model.fits").data[0]
+        polarized[beams] = np.abs(images[1:][(slice(None), *at)]).max()
+        if beams:
+            assert np.abs(images[0][at] - 10).max() < 2e-3
+            assert "operator 1e-03 of |V|" in str(result.whole)
+    assert polarized[False] > 0.05
+    assert polarized[True] < 1e-3
+
+
+def test_clean_through_beams_refuses_visibilities_without_one_of_them():
+    tables = override(read_tables("aw-correction"), SCENE)
+    with pytest.raises(InputError, match=r"\[image\] beams = true takes visibilities as they were: leave the table"):
+        parse(tables | {"image": CLEANED, "correct": {"beam": "centre"}})

@@ -268,3 +268,21 @@ def test_a_scene_that_cleans_writes_model_and_residual_and_says_how_it_ended(tmp
     assert all(end["ended"] for end in said["clean"]) and set(said["solid_angle_sr"]) == {"fit", "sum"}
     with pytest.raises(InputError, match=r"\[image\] .*gain of 3"):
         parse(override(tables, ["image.gain=3.0"]))
+
+
+def test_a_mask_of_its_own_grows_with_the_cycles_and_keeps_noise_out_of_the_model():
+    """A source that is at first below 5 sigma of the sidelobes of another is in the mask later; noise never is."""
+    both = seen((1.0, 0.0, 0.0, 0.0))
+    both = both.with_data(both.data + 0.1 * seen((1.0, 0.0, 0.0, 0.0), -6, -4).data).with_noise(1e4 * u.Jy, seed=1)
+    made = CleanImager(**SIZE, cycles=8, auto_mask=5, sigma=1).imaged(both)
+    said = made.record["clean"][0]
+    model = made.beside["model"].data[0, 0]
+    assert flux_at(made.cube)[0, 0] == pytest.approx(1, abs=6 * said["noise_jy"])
+    assert flux_at(made.cube, -6, -4)[0, 0] == pytest.approx(0.1, abs=6 * said["noise_jy"])
+    first = CleanImager(**SIZE, threshold=10 * u.Jy, auto_mask=5, sigma=1).imaged(both).record["clean"][0]
+    assert 0 < first["mask"] < said["mask"] < 0.15
+    assert np.mean(model != 0) <= said["mask"]
+    everywhere = CleanImager(**SIZE, cycles=8, sigma=1).imaged(both).beside["model"].data[0, 0]
+    assert np.mean(everywhere != 0) > 2 * np.mean(model != 0)
+    with pytest.raises(InputError, match="auto_mask = 3 is not above sigma = 3"):
+        CleanImager(**SIZE, auto_mask=3)

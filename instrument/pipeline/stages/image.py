@@ -50,7 +50,10 @@ class Image(Stage):
         kind = settings.get(KIND, "dirty")
         if kind not in names("imagers"):
             raise InputError(f"kind = {brief(kind)}: {did_you_mean(str(kind), names('imagers'))}")
-        return cls(imager=load("imagers", kind, **{k: v for k, v in settings.items() if k != KIND}))
+        imager = load("imagers", kind, **{k: v for k, v in settings.items() if k != KIND})
+        if kind == "clean" and imager.beams and "correct" in beside.tables:
+            raise InputError("beams = true takes visibilities as they were: leave the table [correct] out")
+        return cls(imager=imager)
 
     def ranges(self) -> tuple[tuple[float, float] | None, ...]:
         """That of the imager."""
@@ -64,6 +67,8 @@ class Image(Stage):
         afford(8.0 * 12 * channels * pixels**2, what, "lower image.pixels, or the number of channels")
         if isinstance(self.imager, Imager) and self.imager.idle:
             unused("[image]", ["robust"], f"it is of weighting = 'briggs', and this is '{self.imager.weighting}'")
+        if "tolerance" in self.imager.model_fields_set and not self.imager.through_beams:
+            unused("[image]", ["tolerance"], "it is that of the beams, and beams = true is not given")
 
     def work(self, run: Running) -> StageWork:
         """That of images of all channels."""
