@@ -95,6 +95,9 @@ class BeamImager(SolvingImager):
         psf = fit_psf(np.stack([psf for _, psf, _ in done]), self.pixel)
         images, models = (np.stack([getattr(found, name) for found, *_ in done]) for name in ("images", "model"))
         beside = {}
+        if self.way == "joint":
+            for found, *_ in done:
+                found.record["polarized"] = _polarized(found.model)
         if self.way != "normalised":
             beside["model"] = self._cube(first, given, models, "Jy/pixel")
         if self.way == "joint":
@@ -205,6 +208,12 @@ class BeamImager(SolvingImager):
         a, b = block.antenna1, block.antenna2
         sky = PointSky.at(block.phase_centre.skycoord, [[1.0, 0.0, 0.0, 0.0]])
         return image_operator(Problem(block.at, Chain(), sky, a, b, block.integration_s), grid, self.tolerance)
+
+
+def _polarized(model: Float) -> float:
+    """The largest sqrt(Q² + U²) / I of the components of a model (4, N, N); NaN without any."""
+    i, q, u, _ = model[:, model[0] > 0]
+    return float(np.max(np.hypot(q, u) / i, initial=0.0)) if len(i) else float("nan")
 
 
 def _channel_of(given: Visibilities | VisibilityFile, channel: int) -> Visibilities:

@@ -118,12 +118,14 @@ def test_the_galaxy_leaks_into_i_what_is_published(tmp_path):
     assert status == 0
     assert record["checks"]["prediction"]["passed"]
     cube = read_cube(folder / "cube.fits")
-    y, x = np.mgrid[:128, :128] - 64
-    inside = np.hypot(x, y) * 2 / 60 < 1.9  # deg
+    y, x = np.mgrid[:184, :184] - 92
+    inside = np.hypot(x, y) * 1.4 / 60 < 1.9  # deg
     for i, q, u, v in cube.data[:, :, inside]:
         p = np.sqrt(np.mean(q**2 + u**2))
         assert 2e-3 < np.std(i) / p < 4e-3
         assert np.std(v) / p < 1.5e-4
+    whole = [np.std(planes[0]) / np.hypot(np.std(planes[1]), np.std(planes[2])) for planes in cube.data]
+    np.testing.assert_allclose(record["leaked"]["I"], whole, rtol=1e-4)
 
 
 def test_every_shipped_scene_has_a_plan(capsys):

@@ -19,6 +19,7 @@ from instrument.pipeline.stages.analyze_work import cube_products, photometry, t
 from instrument.pipeline.stages.cube import CubeAnalysis
 from instrument.pipeline.stages.image import Image, ImageResult
 from instrument.pipeline.stages.leakage import EXPECTED_JONES, LeakageRun, listed
+from instrument.pipeline.stages.leaked import Leaked
 from instrument.pipeline.stages.recovered import recovered, recovering, signal_of
 from instrument.pipeline.work import Items, StageWork
 from instrument.plan import Item
@@ -128,6 +129,8 @@ class _AnalyzeRun(StageRun):
         if "spectrum-2d" in self.settings.products:
             found.append(self._spectra())
         if self.settings.cube is not None:
+            if "noise" not in self.run.stages:  # which is in I and V too
+                found.append(Leaked.of(self.run.plan.problem, self._images().cube))
             products = self.settings.cube.run(self._images().cube)
             self.run.parts.setdefault(self.run.now, {}).update(products.seconds)
             found.append(products)

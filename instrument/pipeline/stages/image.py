@@ -196,7 +196,22 @@ class ImageResult(StageResult):
         if self.cube.psf is None:
             return []
         major, minor = (number(width) for width in self.record()["image"]["psf_arcmin"])
-        return [Card("PSF", f"{major}′ × {minor}′", "width at half maximum")]
+        cards = [Card("PSF", f"{major}′ × {minor}′", "width at half maximum")]
+        shares = [row["polarized"] for rows in self._ended.values() for row in rows if "polarized" in row]
+        if np.isfinite(shares).any():
+            text = f"{np.nanmax(shares):.1e} of I"
+            cards.append(Card("Polarization of the sources", text, "the most of the components of the model"))
+        return cards
+
+    @property
+    def _ended(self) -> dict[str, list[dict[str, Any]]]:
+        """What the imager says of every channel, by what it calls that."""
+        told = {name: rows for name, rows in self.said.items() if isinstance(rows, list) and rows}
+        return {name: rows for name, rows in told.items() if all(isinstance(row, dict) for row in rows)}
+
+    def tables(self) -> list[Section]:
+        """How every channel ended, where the imager says so."""
+        return [Section(f"How {name} ended", [_table_of(rows)]) for name, rows in self._ended.items()]
 
     def sections(self, draw: Draw) -> list[Section]:
         """Images of the first, middle and last channel, the PSF, and the rms of each Stokes parameter in them."""
@@ -224,6 +239,17 @@ class ImageResult(StageResult):
         rows = [[stokes, *(float(values[s]) for values in rms.values())] for s, stokes in enumerate("IQUV")]
         text = f"Rms of the images, {self.cube.unit}."
         return [Section("Images", [Figures(entries), Table(["Stokes", *heads], rows, text)])]
+
+
+def _table_of(rows: list[dict[str, Any]]) -> Table:
+    """Rows of names and values, a column for every name that any has."""
+    heads = list(dict.fromkeys(name for row in rows for name in row))
+    cells = [[_in_words(row.get(name, "")) for name in heads] for row in rows]
+    return Table([name.replace("_", " ") for name in heads], cells)
+
+
+def _in_words(value: Any) -> Any:
+    return " to ".join(map(str, value)) if isinstance(value, list) else value
 
 
 def _rms(plane: Float) -> float:
