@@ -213,5 +213,6 @@ def test_a_crowd_that_was_not_measured_is_dots():
 
 
 def test_a_wrong_product_in_a_scene_is_told_the_near_one():
-    with pytest.raises(InputError, match=r"'leekage' is not one of 'leakage', 'spectrum-2d': did you mean 'leakage'\?"):
+    known = "'leakage', 'spectrum-2d', 'recovered'"
+    with pytest.raises(InputError, match=rf"'leekage' is not one of {known}: did you mean 'leakage'\?"):
         Analyze(products=["leekage"])
