@@ -10,7 +10,7 @@ from pydantic import Field
 
 from instrument import correlations, mat2
 from instrument.checked import checked
-from instrument.errors import InputError, RefusedError
+from instrument.errors import InputError, RefusedError, warn
 from instrument.image.base import Imaged, Kept, SolvingImager
 from instrument.image.beam_solve import Channel, Corrected, joint, normalised, predicted
 from instrument.image.beam_weights import mueller_weights
@@ -32,6 +32,7 @@ from instrument.units import ArrayOf, Direction, Float, unit_vectors
 from instrument.visibilities import Visibilities, VisibilitySet
 from instrument.visibility_sets import VisibilityFile, as_set
 
+BESIDE = 1e-4  # of a pixel, from its centre to a source: 1.5e-4 rad of phase at 1 arcmin and 800 wavelengths
 SAME = 1e-9  # of a frequency or a time, by which data and an operator may differ
 
 
@@ -140,13 +141,22 @@ class BeamImager(SolvingImager):
         return out
 
     def for_sky(self, sky: PlacedSky, centre: Direction) -> Self:
-        """With a mask of the pixels of the sources of a list, where the way needs one and has none."""
+        """With a mask of the pixels of the sources of a list, where the way needs one and has none.
+
+        Warns of sources that lie beside the centres of their pixels: no component is where they are.
+        """
         listed = points_of(sky)
         if self.way != "joint" or self.mask is not None or listed is None:
             return self
         l, m, _ = lmn(unit_vectors(*listed.directions()), centre).T
         x, y = (np.rint(a / self.pixel).astype(int) + self.pixels // 2 for a in (-l, m))
         inside = (x >= 0) & (x < self.pixels) & (y >= 0) & (y < self.pixels)
+        off = np.hypot(-l / self.pixel - (x - self.pixels // 2), m / self.pixel - (y - self.pixels // 2))[inside]
+        if (beside := int((off > BESIDE).sum())) > 0:
+            warn(
+                f"{beside} of {len(off)} sources lie beside the centre of their pixel, by up to {off.max():.2g} "
+                "pixels: components at pixels are not where they are, and leave much of them; take another pixel"
+            )
         mask = np.zeros((self.pixels, self.pixels), bool)
         mask[y[inside], x[inside]] = True
         return self.with_fields(mask=mask)

@@ -1,5 +1,7 @@
 """Beam-corrected images: matrices against the operator, leakage of known sources and of a diffuse sky removed."""
 
+import warnings
+
 import numpy as np
 import pytest
 from astropy import units as u
@@ -9,7 +11,7 @@ from astropy.io import fits
 import instrument
 from instrument import BeamImager, CleanImager, ImageGrid, ImageSky, InputError, Observation, Scene, read_cube
 from instrument.cli import main
-from instrument.errors import RefusedError
+from instrument.errors import InstrumentWarning, RefusedError
 from instrument.image.beam_weights import mueller_weights
 from instrument.observe.directions import offset
 from instrument.predict.base import EVERY
@@ -163,6 +165,18 @@ def test_a_run_writes_the_maps_and_shows_them(tmp_path):
     assert f"{blank:.0%} of the pixels have none" in page
     assert (tmp_path / "out" / "maps.png").is_file()
     assert ">How beam ended<" in page and ">without data<" in page
+
+
+def test_sources_between_pixels_are_said():
+    sky = instrument.load("skies", "grid", shape=(2, 2), spacing=32 * u.arcmin, flux=10 * u.Jy)
+    centre = plan_of(sky, stations=SOME[:3], interval=2 * u.hour).problem.at.centre
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert BeamImager(pixels=24, pixel=8 * u.arcmin, way="joint").for_sky(sky.about(centre), centre).mask.sum() == 4
+    with pytest.warns(
+        InstrumentWarning, match="4 of 4 sources lie beside the centre of their pixel, by up to 0.57 pix"
+    ):
+        BeamImager(pixels=24, pixel=10 * u.arcmin, way="joint").for_sky(sky.about(centre), centre)
 
 
 def test_a_wrong_beam_leaves_leakage_in_proportion():
