@@ -3,18 +3,20 @@
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from astropy import units as u
 from astropy.table import QTable
 
-from instrument import InputError, Stage
+from instrument import InputError, Stage, StokesCube
 from instrument.analyze.sources.photometry import ForcedPhotometry
 from instrument.pipeline.run import run
 from instrument.pipeline.scene_file import parse
 from instrument.pipeline.scene_text import override, read_tables
 from instrument.pipeline.stage import in_order
+from instrument.pipeline.stages.leaked import Leaked
 
 PAGE = Path(__file__).parents[2] / "docs" / "extending.md"
 SMALL = [
@@ -134,3 +136,24 @@ def test_a_record_never_takes_the_place_of_what_is_there():
     merge(record, {"seconds": 3, "mine": 1, "checks": {"prediction": {"passed": True}}}, "flagged")
     assert record["seconds"] == {"predict": 1.0} and record["flagged.seconds"] == 3 and record["mine"] == 1
     assert record["checks"] == {"prediction": {"passed": False}, "flagged.prediction": {"passed": True}}
+
+
+def test_what_a_sky_does_not_have_and_images_show_has_leaked():
+    """Shares by hand, NaN left out, a channel without data NaN; nothing of a sky that has I, V or no polarization."""
+    rng = np.random.default_rng(1)
+    data = rng.normal(size=(3, 4, 16, 16)) * np.array([3e-3, 1, 2, 5e-5])[:, None, None]
+    data[0, :, 4], data[2] = np.nan, np.nan
+    cube = StokesCube(data, [150, 151, 152] * u.MHz, 1 * u.arcmin)
+
+    def of(*there):
+        sky = SimpleNamespace(nonzero=lambda freq_hz: there)
+        return Leaked.of(SimpleNamespace(sky=sky, at=SimpleNamespace(freq_hz=cube.freq_hz)), cube)
+
+    found = of(False, True, True, False)
+    i, q, p, v = np.moveaxis(np.delete(data[0], 4, axis=1), 0, 0)
+    due = np.array([i.std(), v.std()]) / np.hypot(q.std(), p.std())
+    np.testing.assert_allclose([found.shares["I"][0], found.shares["V"][0]], due, rtol=1e-12)
+    assert np.isnan(found.shares["I"][2])
+    assert found.cards()[0].value.startswith("0.1") and "of P in V" in found.lines()[0]
+    assert set(of(True, True, True, False).shares) == {"V"} and not of(True, True, True, False).cards()
+    assert of(False, False, False, False).record() == {} and of(True, True, False, True).lines() == []
