@@ -63,7 +63,7 @@ class Plan(VisibilitySet):
     bounds: tuple[Item, ...]
     scale_jy: float
     seconds: float = field(compare=False, default=0.0)  # on a machine of speed 1
-    next_decade: str = ""  # what a tenth of the tolerance would cost
+    decade: Callable[[], str] = field(compare=False, repr=False, default=str)  # works `next_decade` out
     checker: Checker | None = field(compare=False, repr=False, default=None)  # sees the blocks as they pass
 
     @property
@@ -83,6 +83,11 @@ class Plan(VisibilitySet):
     def ready(self) -> Prepared:
         """The engine made ready for the problem."""
         return self.engine.prepare(self.problem, self.engine_tolerance)
+
+    @cached_property
+    def next_decade(self) -> str:
+        """What a tenth of the tolerance would cost, in words: for whoever asks, as its engine must be prepared."""
+        return self.decade()
 
     @property
     def slices(self) -> list[tuple[slice, slice]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -73,7 +74,7 @@ def make_plan(
         bounds=(Item(found.label, "", ready.bound), last) if ready.bound and not said else (last,),
         scale_jy=scale_jy,
         seconds=work.seconds / workers,
-        next_decade=_next_decade(full, tolerance, rounded, engine, work.seconds),
+        decade=partial(_next_decade, full, tolerance, rounded, engine, work.seconds),
     )
     vars(plan)["ready"] = ready  # or it would be prepared a second time
     return plan

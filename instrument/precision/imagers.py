@@ -9,7 +9,7 @@ import numpy as np
 
 import instrument.registry as registry
 from instrument.observe.observation import Observation
-from instrument.precision import cleaning
+from instrument.precision import cleaning, corrected
 from instrument.precision.contest import UNSET, Contest, Entry, Form, Trial
 from instrument.precision.cube_peers import IMAGERS, imager_peers
 from instrument.precision.truth import LIGHT, cis, real
@@ -27,10 +27,10 @@ PIXEL_RAD = float(np.deg2rad(1.5 / 60))
 
 
 def contests(imagers: dict[str, Any], form: Form) -> list[Contest]:
-    """One a size: 40 unpolarized sources behind LOFAR's beams, which leak into Q and U; and those of CLEAN."""
+    """One a size: 40 unpolarized sources behind LOFAR's beams, which leak into Q and U; those of CLEAN and of beams."""
     sums = {name: cls for name, cls in imagers.items() if not cls.restores}
     made = [contest(sums, *size, form) for size in (SIZES[:1] if form.quick else SIZES)] if sums else []
-    return [*made, *cleaning.contests(imagers, form)]
+    return [*made, *cleaning.contests(imagers, form), *corrected.contests(imagers, form)]
 
 
 def contest(imagers: dict[str, Any], stations: int, times: int, pixels: int, form: Form = Form()) -> Contest:  # noqa: B008

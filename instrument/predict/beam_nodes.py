@@ -29,6 +29,9 @@ PLACES = 160  # directions in which nodes are held against beams, half of them o
 ORDERS = (16, 24, 36, 54)  # Chebyshev points a side that are tried
 SAFETY = 2.0  # over the largest error of the products that were looked at
 TO_STOKES = np.array([[1, 0, 0, 1], [1, 0, 0, -1], [0, 1, 1, 0], [0, -1j, 1j, 0]]) / 2  # of pp, pq, qp, qq
+# of the 16 entries of M those that take Q, U, V to I, and I to Q, U, V (3, 16)
+INTO_I = np.kron(TO_STOKES[:1], 2 * TO_STOKES[1:].conj())
+OUT_OF_I = np.kron(TO_STOKES[1:], 2 * TO_STOKES[:1].conj())
 
 
 @dataclass(frozen=True)
@@ -273,7 +276,5 @@ def _measured(nodes: BeamNodes, due: Complex, at_nodes: Complex, places: Float) 
     made = at_nodes.reshape(-1, len(nodes)) @ nodes.at(places).astype(complex)
     wrong = made.reshape(due.shape) - due
     error = float(np.linalg.norm(wrong, axis=1).max())
-    mueller = wrong.reshape(-1, 4, 4, wrong.shape[-1])
-    stokes = np.einsum("ai,nijs,jb->nabs", TO_STOKES, mueller, 2 * TO_STOKES.conj().T, optimize=True)
-    parts = np.linalg.norm(stokes[:, 0, 1:], axis=1), np.linalg.norm(stokes[:, 1:, 0], axis=1)
+    parts = (np.linalg.norm(rows @ wrong, axis=1) for rows in (INTO_I, OUT_OF_I))
     return replace(nodes, error=SAFETY * error, leakage=SAFETY * float(np.maximum(*parts).max()))

@@ -132,6 +132,29 @@ def test_engines_keep_their_tolerance_against_extended_precision():
                 assert trial.error_user <= 100 * asked  # of a leakage of 1 %: it is not lost in the error of all
 
 
+def trial(contest, plugin, asked):
+    (entry,) = (e for e in contest.entries if e.plugin == plugin)
+    return contest.judge(entry.answer(asked), asked)
+
+
+@pytest.mark.long
+def test_of_a_plugin_there_are_the_contests_it_takes_part_in_and_the_floor_falls_with_the_square_of_the_tolerance():
+    found = contests_of("gridded", form=Form(quick=True))
+    assert [one.name.partition(",")[0] for one in found] == ["predict a diffuse sky of 16 x 16 pixels", "floor in P(k)"]
+    floors = [trial(found[1], "gridded", asked) for asked in (1e-2, 1e-4)]
+    assert floors[1].error < 1e-3 * floors[0].error < 1e-6  # power
+    assert all(floor.error_user < 1e-2 * floor.error for floor in floors)  # coherent, most of it
+
+
+@pytest.mark.long
+def test_each_way_to_look_through_beams_leaves_less_of_the_leakage_that_it_is_for():
+    sources, diffuse = contests_of("beam", form=Form(quick=True))[1:]
+    assert {e.plugin for e in sources.entries} == {"beam, normalised", "beam, joint", "clean, CLEAN"}
+    assert {e.plugin for e in diffuse.entries} == {"beam, normalised", "beam, predict"}
+    assert trial(sources, "beam, joint", 8).error < 0.1 * trial(sources, "beam, joint", 2).error < 0.05
+    assert trial(diffuse, "beam, predict", 8).error < 0.5 * trial(diffuse, "beam, normalised", np.nan).error
+
+
 @pytest.mark.long
 def test_solvers_that_say_converged_are_right():
     found = contests_of("calibrators", form=Form(quick=True))

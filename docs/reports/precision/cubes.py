@@ -2,9 +2,10 @@
 
     pip install . rm-tools rm-lite ps_eor && python docs/reports/precision/cubes.py [JOB ...]
 
-JOB is imagers, rm-synthesis, rm-clean, spectra, photometry, which has no peer, or predict-beams (with the packages dp3,
-everybeam and python-casacore). Writes JOB.md, JOB.png and JOB.ecsv beside this file. Everybody has one thread of one
-core; seconds are those of the processor, children too, the median of three, taken in turn.
+JOB is imagers, rm-synthesis, rm-clean, spectra, photometry or gridded (the engine, on diffuse skies), which have no
+peer, or predict-beams (with the packages dp3, everybeam and python-casacore). Writes JOB.md, JOB.png and JOB.ecsv
+beside this file. Everybody has one thread of one core; seconds are those of the processor, children too, the median of
+three, taken in turn.
 """
 
 import resource
@@ -20,7 +21,7 @@ one_thread()
 import numpy as np  # noqa: E402
 
 from instrument.pipeline.record import versions  # noqa: E402
-from instrument.precision import Form, beamed, faraday, imagers, photometry, spectra  # noqa: E402
+from instrument.precision import Form, beamed, diffuse, faraday, imagers, photometry, spectra  # noqa: E402
 from instrument.precision.advice import ERRORS, crossovers, peers_ahead  # noqa: E402
 from instrument.precision.command import table  # noqa: E402
 from instrument.precision.conditions import machine, peers  # noqa: E402
@@ -42,6 +43,7 @@ JOBS = {
         make(FORM, *size) for make in (spectra._floor, spectra._known) for size in ((64, 32), (96, 64))
     ],
     "predict-beams": lambda: [beamed.contest(count, MATRIX, FORM) for count in beamed.SOURCES[1]],
+    "gridded": lambda: diffuse.contests(("direct", "gridded"), Form()),
     "photometry": lambda: [contest for size in photometry.SIZES for contest in photometry._pair(FORM, *size)],
 }
 WHY = {
@@ -58,6 +60,10 @@ WHY = {
     "predict-beams": "DP3 is a process of its own: its start, the reading and the writing of its data set are in its "
     "time, and cost more than the rest where sources are few. It works in 32 bit and sees sources and beam former from "
     "two places on Earth, 0.1 arcsec apart: its error is against the sum in its own frames; against ours it is 2e-6.",
+    "gridded": "What is asked for bounds the largest error over the total flux, whatever the sky and the baseline; "
+    "what comes is far smaller. The error of the leakage alone, that of I of a sky of Q and U over the rms of that I, "
+    "stands beside it. Of what it leaves in P(k) nearly all is coherent along frequency, as beams between nodes are "
+    "wrong in the same way in all channels: it stays at the lowest delays, and the rest is far below the signal.",
     "photometry": "Of n times more integrations the error is sqrt(n) smaller, and the seconds n times as many; what "
     "pixels have beside noise is side lobes of the others, which no integration takes away. By iterations an answer is "
     "said to be converged where it is within ten times of what was asked for, times the condition of the sources.",
@@ -120,7 +126,7 @@ def beside(found):
 
 def answers(found):
     """All that was asked, and what came."""
-    yield "| job | | asked | error | bias of a flux | s | |"
+    yield "| job | | asked | error | in the user's quantity | s | |"
     yield "|---|---|---|---|---|---|---|"
     for contest, rows in found:
         for row in rows:
