@@ -89,6 +89,11 @@ class BeamImager(SolvingImager):
         done = [self._channel(_channel_of(given, f), operator) for f in range(len(given.freq_hz))]
         first = _channel_of(given, 0)
         if all(found.record["without_data"] == 1.0 for found, _, _ in done):
+            if any("singular" in found.record for found, _, _ in done):
+                raise RefusedError(
+                    "the beam towards the phase centre has no inverse at any station: a polarization is missing, or "
+                    "the centre is on a null; nothing to image"
+                )
             raise RefusedError(
                 f"no visibility within uv_range = {self.uv_range} has all four correlations with a weight above 0: "
                 "nothing to image"
@@ -174,14 +179,15 @@ class BeamImager(SolvingImager):
         grid = self.grid(block.phase_centre)
         operator = operator or self._plain(block, grid)
         operator.demand(grid, self.uv_range)
-        known = _known(block)
+        known, whole = _known(block), block.effective_weight.any()
         block, centre = _without_centre(block, operator.problem.chain, known)
         weight = correlations.whole(block.effective_weight, known) * np.ones(block.data.shape[:3])
         weight = weight * _within(block, self.uv_range)
         if not weight.any():
             blank = np.full((4, *grid.pixels), np.nan)
             none = np.full((5, *grid.pixels), np.nan, np.float32)
-            return Corrected(blank, blank, {"without_data": 1.0}), blank[0], none
+            lost = {"singular": 1.0} if whole and not block.effective_weight.any() else {}
+            return Corrected(blank, blank, {"without_data": 1.0, **lost}), blank[0], none
         channel = _place(block, operator)
         problem = operator.problem.block(EVERY, channel).between(block.antenna1, block.antenna2)
         weights = mueller_weights(problem, grid, weight[:, 0], self.amplification, centre, known)

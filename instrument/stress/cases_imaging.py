@@ -183,8 +183,6 @@ def density(_: None) -> Answer:
     return both(*answers)
 
 
-NO_BEAMS = "there is no imager that knows beams"
 MISSING = (
-    not_there("48", "imagers", "a null of the beam after correction", "masked, noise x kappa stated", NO_BEAMS),
     not_there("49", "imagers", "a cut at a baseline's own length in float32", "the count of float64", "float64 only"),
 )
