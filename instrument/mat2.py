@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from instrument.units import Complex, Float
+from instrument.compiled import compiled
+from instrument.units import Complex, Float, Int
 
 IDENTITY: Complex = np.eye(2, dtype=complex)
 IDENTITY.setflags(write=False)
@@ -44,6 +45,30 @@ def det(a: Complex) -> Complex:
 def sandwich(a: Complex, v: Complex, b: Complex) -> Complex:
     """a v b^H: visibilities v corrupted by the Jones matrices of their two stations."""
     return mul(mul(a, v), herm(b))
+
+
+def between(jones: Complex, v: Complex, one: Int, other: Int) -> Complex:
+    """J_a v J_b^H of matrices of stations (T, F, A | 1, 2, 2) and visibilities (T, F, B, 2, 2) of their pairs (B,)."""
+    shape = np.broadcast_shapes(jones.shape[:2], v.shape[:2])
+    out = np.empty((*shape, *v.shape[2:]), complex)
+    if jones.shape[2] == 1:
+        one = other = np.zeros(len(one), int)
+    j = np.array(np.broadcast_to(jones, (*shape, *jones.shape[2:])), complex, order="C")
+    v = np.ascontiguousarray(np.broadcast_to(v, out.shape), complex)
+    _between(j.reshape(-1, j.shape[2], 4), v.reshape(-1, len(one), 4), one, other, out.reshape(-1, len(one), 4))
+    return out
+
+
+@compiled(nogil=True, fastmath={"contract"}, error_model="numpy")  # data may hold infinities
+def _between(jones: Any, v: Any, one: Any, other: Any, out: Any) -> None:
+    for t in range(v.shape[0]):
+        for n in range(v.shape[1]):
+            a, b = jones[t, one[n]], jones[t, other[n]]
+            p, q, r, s = v[t, n, 0], v[t, n, 1], v[t, n, 2], v[t, n, 3]
+            for i in (0, 2):
+                y, z = a[i] * p + a[i + 1] * r, a[i] * q + a[i + 1] * s
+                out[t, n, i] = y * np.conj(b[0]) + z * np.conj(b[1])
+                out[t, n, i + 1] = y * np.conj(b[2]) + z * np.conj(b[3])
 
 
 def inverse(a: Complex) -> Complex:

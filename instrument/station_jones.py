@@ -47,12 +47,12 @@ def through(vis: Any, jones: Complex, good: Bool | None = None) -> dict[str, Any
     """
     one = jones.shape[2] == 1
     a, b = (slice(None) if one else antenna for antenna in (vis.antenna1, vis.antenna2))
-    left, right = jones[:, :, a], jones[:, :, b]
     weight, flag = vis.weight, vis.flag
     if correlations.APART not in (weight.ndim, flag.ndim):
         with np.errstate(invalid="ignore"):  # data may hold infinities
-            data = mat2.sandwich(left, vis.data, right)
+            data = mat2.between(jones, vis.data, vis.antenna1, vis.antenna2)
     else:
+        left, right = jones[:, :, a], jones[:, :, b]
         unknown = correlations.alike(vis.data, flag)[1] | ~np.isfinite(vis.data)
         flag = correlations.reached(left, unknown, right)
         data = np.where(flag, 0.0, mat2.sandwich(left, np.where(unknown, 0.0, vis.data), right))

@@ -56,7 +56,7 @@ def judged(
         )
     good: Any = np.isfinite(jones).all(axis=(-2, -1))
     each = np.where(good[..., None, None], jones, 0.0)[times.group]
-    fit = mat2.sandwich(each[:, :, a], m, each[:, :, b])
+    fit = mat2.between(each, m, a, b)
     power = weight[..., None, None] * (m.real**2 + m.imag**2)
     held = tied(counted(_sums(power, times.slices)), a, b, stations, pattern)
     inside = held.reshape(good.shape)[times.group]  # data of stations that nothing ties to the others do not count

@@ -48,16 +48,14 @@ class Channel:
         found = self.operator.forward(images[None], EVERY, self.channel, self.pairs)
         if self.centre is None:
             return found
-        a, b = self.pairs
-        return mat2.sandwich(self.centre[:, :, a], found, self.centre[:, :, b])
+        return mat2.between(self.centre, found, *self.pairs)
 
     def back(self, data: Complex, kinds: tuple[int, ...] = STOKES) -> Float:
         """A^H w y, (4, Ny, Nx), of some Stokes parameters; 0 of the others."""
         weight = self.each
         weighted = np.asarray(weight * np.where(weight > 0, data, 0), complex)
         if self.centre is not None:
-            one, other = (mat2.herm(self.centre[:, :, p]) for p in self.pairs)
-            weighted = mat2.sandwich(one, weighted, other)
+            weighted = mat2.between(mat2.herm(self.centre), weighted, *self.pairs)
         return self.operator.adjoint(weighted, EVERY, self.channel, self.pairs, kinds)[0]
 
     def size(self, data: Complex) -> float:

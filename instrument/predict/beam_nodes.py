@@ -44,7 +44,7 @@ class BeamNodes:
 
     __repr__ = short_repr
     lm: Float
-    cardinal: Float  # (K, n, n): the functions at Chebyshev points of the rectangle, along l and m
+    series: Float  # (K, d + 1, d + 1): their Chebyshev series over the rectangle, along l and m, i + j <= d
     reach: tuple[float, float]  # half sides of the rectangle
     error: float = 0.0
     leakage: float = 0.0
@@ -56,15 +56,16 @@ class BeamNodes:
 
     def on(self, grid: ImageGrid) -> Float:
         """The functions c_k on all pixels, (K, Ny, Nx)."""
-        points = chebyshev(self.cardinal.shape[1])
-        x, y = (lagrange(points, a / far) for a, far in zip((grid.east, grid.north), self.reach, strict=True))
-        return np.ascontiguousarray(np.einsum("yb,kab,xa->kyx", y, self.cardinal, x, optimize=True))
+        x, y = (self._terms(a / far) for a, far in zip((grid.east, grid.north), self.reach, strict=True))
+        return np.ascontiguousarray(np.einsum("yb,kab,xa->kyx", y, self.series, x, optimize=True))
 
     def at(self, lm: Float) -> Float:
         """The functions in some directions (S, 2): (K, S)."""
-        points = chebyshev(self.cardinal.shape[1])
-        x, y = (lagrange(points, lm[:, i] / self.reach[i]) for i in range(2))
-        return np.asarray(np.einsum("sb,kab,sa->ks", y, self.cardinal, x, optimize=True))
+        x, y = (self._terms(lm[:, i] / self.reach[i]) for i in range(2))
+        return np.asarray(np.einsum("sb,kab,sa->ks", y, self.series, x, optimize=True))
+
+    def _terms(self, at: Float) -> Float:
+        return np.asarray(np.polynomial.chebyshev.chebvander(at, self.series.shape[1] - 1), float)
 
 
 ONE = BeamNodes(np.zeros((1, 2)), np.ones((1, 1, 1)), (1.0, 1.0))  # for beams that are the same everywhere
@@ -108,19 +109,37 @@ def beam_nodes(problem: Problem, grid: ImageGrid, tolerance: float) -> BeamNodes
     orders, lm, drawn = _smooth(beams, some, grid, half, (due, pairs, places), wanted)
     chosen = _chosen(_products(beams, _towards(some, grid, lm), None, seed=1), wanted)
 
-    def measured(k: int) -> BeamNodes:
+    def measured(k: int, degree: int | None = None) -> BeamNodes:
         nodes, card = chosen[k]
-        found = BeamNodes(lm[nodes], card.reshape(len(nodes), orders, orders), half)
+        found = BeamNodes(lm[nodes], _series(card.reshape(len(nodes), orders, orders), degree), half)
         return _measured(found, due, drawn[:, :, nodes], places)
 
     best, low, high = measured(-1), -1, len(chosen) - 1
+    kept = high
     if best.error > wanted:
         raise _rough(grid, best.error, wanted)
     while high - low > 1:
         middle = (low + high) // 2
         found = measured(middle)
-        low, high, best = (low, middle, found) if found.error <= wanted else (middle, high, best)
+        low, high, best, kept = (low, middle, found, middle) if found.error <= wanted else (middle, high, best, kept)
+    for degree in range(2, orders):  # what is beyond is noise of the choice of nodes, most of it
+        found = measured(kept, degree)
+        if found.error <= wanted:
+            best = found
+            break
     return replace(best, peak=peak, growth=float(np.abs(best.on(_coarse(grid))).sum(axis=0).max()))
+
+
+def _series(values: Float, degree: int | None) -> Float:
+    """Chebyshev series (K, d + 1, d + 1) of values at Chebyshev points (K, n, n), without terms above a degree."""
+    n = values.shape[1]
+    turn = np.polynomial.chebyshev.chebvander(chebyshev(n), n - 1).T * (2 / n)
+    turn[0] /= 2
+    series = np.asarray(turn @ values @ turn.T)
+    if degree is None:
+        return series
+    total = np.add.outer(np.arange(degree + 1), np.arange(degree + 1))
+    return np.ascontiguousarray(np.where(total <= degree, series[:, : degree + 1, : degree + 1], 0.0))
 
 
 def _smooth(

@@ -37,7 +37,7 @@ class BeamTimes(NamedTuple):
             return np.ascontiguousarray(values)
         out = np.empty((count, *values.shape[1:]), complex)
         flat = np.ascontiguousarray(values).reshape(len(values), -1)
-        _between(flat, self.step, _weights(self.step), out.reshape(count, -1))
+        _between(flat, self.step, weights(self.step), out.reshape(count, -1))
         return out
 
 
@@ -71,14 +71,14 @@ def beam_times(beams: Chain, at: Sampling, interval_s: float, span: tuple[int, i
         if j.shape[0] == 1:
             return BeamTimes(step, 0.0)
         j = j[np.argsort(order)].reshape(len(first), POINTS + 1, *j.shape[1:])
-        made = np.tensordot(_weights(step)[step // 2], j[:, :POINTS], axes=(0, 1))
+        made = np.tensordot(weights(step)[step // 2], j[:, :POINTS], axes=(0, 1))
         error = SAFETY * float(np.linalg.norm(made - j[:, POINTS], axis=(-2, -1)).max())
         if error <= wanted:
             return BeamTimes(step, error)
     return EACH
 
 
-def _weights(step: int) -> Float:
+def weights(step: int) -> Float:
     """Lagrange's weights of the instants about integrations 0 ... step - 1 after the third, (step, POINTS)."""
     x = np.arange(step) / step + POINTS // 2 - 1
     nodes = np.arange(POINTS)

@@ -1,4 +1,7 @@
-"""One atom of the gridded engine: a channel of some integrations, its samples, its gridder and beams at the nodes."""
+"""One atom of the gridded engine: a channel of some integrations, with a w-gridder for each node.
+
+Its brother on one grid for all nodes is `separable_atom.py`; tests/accuracy/test_separable.py holds them together.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,10 @@ from instrument.units import Complex, Direction, Float
 
 @dataclass(frozen=True)
 class Atom:
-    """Samples (N,) with their antennas and slots, a gridder, beams at the instants (instants, A, K, 2, 2)."""
+    """Samples (N,) with their antennas and slots, a gridder, beams at the instants (instants, A, K, 2, 2).
+
+    `functions` (K, Ny, Nx) are those of the nodes.
+    """
 
     samples: TimeSamples
     listed: tuple[Any, Any, Any]
@@ -27,27 +33,28 @@ class Atom:
     beams: Complex
     instants: BeamTimes
     slots: int
+    functions: Float
 
-    def forward(self, images: Float, functions: Float) -> Complex:
-        """Samples (N, 4) of images (4, Ny, Nx), by the functions (K, Ny, Nx) of the nodes."""
+    def forward(self, images: Float) -> Complex:
+        """Samples (N, 4) of images (4, Ny, Nx)."""
         out = np.zeros((self.samples.count, 4), complex)
         there = np.array([s for s in range(4) if images[s].any()], int)
-        for k in range(len(functions) if len(there) else 0):
-            planes = np.array([self.gridder.visibilities(functions[k] * images[s]) for s in there])
+        for k in range(len(self.functions) if len(there) else 0):
+            planes = np.array([self.gridder.visibilities(self.functions[k] * images[s]) for s in there])
             if self.shift is not None:
                 planes *= self.shift
             _forward(planes, there, self._jones(k), *self.listed, out)
         return out
 
-    def adjoint(self, samples: Complex, functions: Float, kinds: tuple[int, ...]) -> Float:
+    def adjoint(self, samples: Complex, kinds: tuple[int, ...]) -> Float:
         """Images (4, Ny, Nx) of samples (N, 4), of some Stokes parameters, 0 in the others."""
         out, planes = np.zeros((4, *self.gridder.pixels)), np.empty((4, len(samples)), complex)
-        for k in range(len(functions)):
+        for k in range(len(self.functions)):
             _adjoint(samples, self._jones(k), *self.listed, planes)
             if self.shift is not None:
                 planes *= self.shift.conj()
             for s in kinds:
-                out[s] += functions[k] * self.gridder.image(planes[s])
+                out[s] += self.functions[k] * self.gridder.image(planes[s])
         return out
 
     def _jones(self, node: int) -> Complex:

@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from instrument import mat2
 from instrument.errors import RefusedError
 from instrument.observe.directions import LIGHT, lmn, offset
 from instrument.observe.grid import ImageGrid
+from instrument.observe.sampling import Sampling
 from instrument.predict.base import EVERY, Predictor, Problem, Work
 from instrument.predict.beam_nodes import ONE, BeamNodes, beam_nodes, heights
 from instrument.predict.beam_times import EACH, BeamTimes, beam_times
@@ -27,7 +28,9 @@ from instrument.predict.gridding import FINEST, Gridder
 from instrument.predict.operator import STOKES, ImageOperator
 from instrument.predict.pairs import picked, placed
 from instrument.predict.rounding import known_gain
-from instrument.predict.time_samples import LONGEST_S, TimeSamples, taps_for, time_samples, with_skirts
+from instrument.predict.separable import Kernels, kernels_for
+from instrument.predict.separable_atom import SeparableAtom
+from instrument.predict.time_samples import LONGEST_S, TimeSamples, taps_for, time_samples, windows, with_skirts
 from instrument.sky.image import ImageSky
 from instrument.sky.pixels import PixelSky
 from instrument.units import Complex, Direction, Float, Int, unit_vectors
@@ -35,9 +38,20 @@ from instrument.visibilities import Visibilities
 
 LARGEST_ATOM = 2.6e8  # bytes of the visibilities of one channel that are made at once
 KEPT = 2  # atoms
+FEW_NODES = 3  # up to which each has a gridder of its own
 FEW = 48  # integrations up to which all are worked out as they are
 NODES, TIMES, BETWEEN, GRIDDING = 0.5, 0.1, 0.15, 0.2  # shares of a tolerance
 ROOT2 = 2**0.5  # the norm of the brightness of 1 Jy
+AnyAtom = Atom | SeparableAtom
+
+
+class Span(NamedTuple):
+    """Integrations `begin` to `end` from the first of an atom: stations (N, A, 3) there, the instants of its beams."""
+
+    begin: int
+    end: int
+    stations_m: Float
+    moments: Sampling
 
 
 class Gridded(Predictor):
@@ -67,6 +81,7 @@ class Gridded(Predictor):
         if problem.shape[0] > FEW and problem.at.regular(problem.interval_s):
             tail = int(taps_for(BETWEEN * share / peak)[0] / 2 * LONGEST_S / problem.interval_s)
             instants = _instants(problem, sky, nodes, (-tail, problem.shape[0] + tail), TIMES * share)
+        sampled = GRIDDING * share / (2 * peak)  # what gridding may be wrong by, summed over the nodes
         ready = GriddedImages(
             engine=self,
             problem=problem,
@@ -74,11 +89,12 @@ class Gridded(Predictor):
             nodes=nodes,
             instants=instants,
             between=BETWEEN * share / peak if instants.step else 0.0,
-            accuracy=min(1e-2, GRIDDING * share / (2 * nodes.growth * peak)),
+            accuracy=min(1e-2, sampled / nodes.growth),
+            kernels=kernels_for(nodes, sampled) if len(nodes) > FEW_NODES else None,
         )
         error = nodes.error + 2 * nodes.growth * peak**0.5 * ROOT2 * instants.error
-        error += (
-            peak * (taps_for(ready.between)[1] if ready.between else 0.0) + 2 * nodes.growth * peak * ready.accuracy
+        error += peak * (taps_for(ready.between)[1] if ready.between else 0.0) + 2 * peak * min(
+            sampled, 1e-2 * nodes.growth
         )
         return replace(ready, bound=ROOT2 * max(outer, 1.0) * error, omission=ready.said())
 
@@ -95,6 +111,7 @@ class GriddedImages(ImageOperator):
     instants: BeamTimes = EACH
     between: float = 0.0  # the error of interpolation between samples, 0 for every integration
     accuracy: float = 1e-6
+    kernels: Kernels | None = None  # for all nodes at once, where they are many
 
     def __getstate__(self) -> dict[str, Any]:
         """What goes to another process: what was decided, and nothing that can be made again there."""
@@ -105,11 +122,9 @@ class GriddedImages(ImageOperator):
         block = self.block(times, channels)
         out = np.zeros((*block.shape, 2, 2), complex)
         for seen, f, atom in self._atoms(times, channels):
-            here = np.zeros((seen.stop - seen.start, block.shape[2], 4), complex)
-            atom.samples.spread(atom.forward(images[f], self.functions), here)
-            out[seen, f] = here.reshape(*here.shape[:2], 2, 2)
+            atom.samples.spread(atom.forward(images[f]), out[seen, f].reshape(-1, block.shape[2], 4))  # a view
         if (gains := self._gains(block)) is not None:
-            out = mat2.sandwich(gains[:, :, block.antenna1], out, gains[:, :, block.antenna2])
+            out = mat2.between(gains, out, block.antenna1, block.antenna2)
         return out if pairs is None else picked(self.problem, out, pairs)
 
     def adjoint(
@@ -125,12 +140,11 @@ class GriddedImages(ImageOperator):
         if pairs is not None:
             data = placed(self.problem, data, pairs)
         if (gains := self._gains(block)) is not None:
-            one, other = mat2.herm(gains[:, :, block.antenna1]), mat2.herm(gains[:, :, block.antenna2])
-            data = mat2.sandwich(one, data, other)
+            data = mat2.between(mat2.herm(gains), data, block.antenna1, block.antenna2)
         out = np.zeros((block.shape[1], 4, *self.sky.grid.pixels))
         for seen, f, atom in self._atoms(times, channels):
             here = np.ascontiguousarray(data[seen, f]).reshape(-1, block.shape[2], 4)
-            out[f] += atom.adjoint(atom.samples.gather(here), self.functions, kinds)
+            out[f] += atom.adjoint(atom.samples.gather(here), kinds)
         return out
 
     def predict(self, times: slice, channels: slice) -> Visibilities:
@@ -212,12 +226,9 @@ class GriddedImages(ImageOperator):
             return np.zeros(problem.shape[2], int), np.full(problem.shape[2], count)
         uv = problem.at.at_centre().block(slice(first, last), slice(channel, channel + 1)).uvw_m[..., :2]
         uv = uv * (float(problem.at.freq_hz[channel]) / LIGHT)
-        within = np.empty((count, problem.shape[2]), bool)
-        for t in range(count):  # never (T, B, 2)
-            length = np.linalg.norm(uv[t, problem.antenna1] - uv[t, problem.antenna2], axis=-1)
-            within[t] = (length >= problem.uv_range[0]) & (length <= problem.uv_range[1])
-        there = within.any(axis=0)
-        return np.argmax(within, axis=0) * there, (count - np.argmax(within[::-1], axis=0)) * there
+        begin, end = np.zeros((2, problem.shape[2]), int)
+        windows(uv, problem.antenna1, problem.antenna2, np.square(problem.uv_range), begin, end)
+        return begin, end
 
     def _samples(self, first: int, last: int, channel: int) -> TimeSamples:
         """Samples of some integrations of a channel."""
@@ -238,7 +249,7 @@ class GriddedImages(ImageOperator):
             for f, channel in enumerate(range(*channels.indices(self.problem.shape[1]))):
                 yield slice(first - start, last - start), f, first, last, channel
 
-    def _atoms(self, times: slice, channels: slice) -> Iterator[tuple[slice, int, Atom]]:
+    def _atoms(self, times: slice, channels: slice) -> Iterator[tuple[slice, int, AnyAtom]]:
         """Each atom of some times and channels that has samples: its times and its channel among them."""
         for seen, f, *where in self._cuts(times, channels):
             atom = self._kept.get((*where,)) or self._made(*where)
@@ -246,11 +257,11 @@ class GriddedImages(ImageOperator):
                 yield seen, f, atom
 
     @cached_property
-    def _kept(self) -> dict[tuple[int, ...], Atom]:
+    def _kept(self) -> dict[tuple[int, ...], AnyAtom]:
         """The latest atoms, for those who ask for the same again."""
         return {}
 
-    def _made(self, first: int, last: int, channel: int) -> Atom | None:
+    def _made(self, first: int, last: int, channel: int) -> AnyAtom | None:
         """An atom, kept in the place of the oldest; `None` where it has no samples."""
         samples = self._samples(first, last, channel)
         if not samples.count:
@@ -261,23 +272,45 @@ class GriddedImages(ImageOperator):
         self._kept[first, last, channel] = atom
         return atom
 
-    def _atom(self, samples: TimeSamples, first: int, last: int, channel: int) -> Atom:
-        at, freq, interval = self.problem.at, float(self.problem.at.freq_hz[channel]), self.problem.interval_s
-        here = slice(first, last), slice(channel, channel + 1)
+    def _atom(self, samples: TimeSamples, first: int, last: int, channel: int) -> AnyAtom:
+        at, freq = self.problem.at, float(self.problem.at.freq_hz[channel])
         rows, slots = samples.listed()
-        begin, end = int(slots.min()), int(slots.max()) + 1
-        stations = at.at_centre().block(*here).every(interval, np.arange(begin, end)).uvw_m * (freq / LIGHT)
+        span = self._span(first, last, int(slots.min()), int(slots.max()) + 1)
         one, other = self.problem.antenna1[rows], self.problem.antenna2[rows]
-        uvw = stations[slots - begin, one] - stations[slots - begin, other]
+        slots = slots - span.begin
+        uvw = (span.stations_m[slots, one] - span.stations_m[slots, other]) * (freq / LIGHT)
         uvw, shift = about(uvw, self._centre, at.centre)
-        moments = self.instants.instants(begin, end)
-        beams = _towards(self.problem, self.sky, self.nodes).block(*here).every(interval, moments)
+        beams = span.moments.block(slice(None), slice(channel, channel + 1))
         jones = self.problem.chain.beams().jones(beams)
-        jones = np.broadcast_to(jones, (len(moments), 1, at.shape[2], len(self.nodes), 2, 2))[:, 0]
+        jones = np.broadcast_to(jones, (len(beams.slots_s), 1, at.shape[2], len(self.nodes), 2, 2))[:, 0]
         threads = 1 if self.problem.shape[1] > 1 else os.cpu_count() or 1
+        listed = one.astype(np.int32), other.astype(np.int32), slots.astype(np.int32)
+        if self.kernels is not None:
+            there = samples, listed, uvw, shift, self.sky.grid, self.nodes, self.kernels, jones, self.instants
+            if (separable := SeparableAtom(*there, threads)).fits:
+                return separable
         gridder = Gridder(uvw, self.sky.grid.pixels, self.sky.grid.pixel, self.accuracy, threads)
-        listed = one.astype(np.int32), other.astype(np.int32), (slots - begin).astype(np.int32)
-        return Atom(samples, listed, gridder, shift, jones, self.instants, end - begin)
+        return Atom(samples, listed, gridder, shift, jones, self.instants, span.end - span.begin, self.functions)
+
+    def _span(self, first: int, last: int, begin: int, end: int) -> Span:
+        """Where stations and the Earth stand at integrations `begin` to `end`, the same for all channels of an atom."""
+        known = self._spans.get((first, last))
+        if known is not None and known.begin <= begin and end <= known.end:
+            return known
+        if known is not None:
+            begin, end = min(begin, known.begin), max(end, known.end)
+        at, interval = self.problem.at.block(slice(first, last), EVERY), self.problem.interval_s
+        stations = at.at_centre().every(interval, np.arange(begin, end)).uvw_m
+        moments = _towards(self.problem, self.sky, self.nodes).block(slice(first, last), EVERY)
+        made = Span(begin, end, stations, moments.every(interval, self.instants.instants(begin, end)))
+        self._spans.clear()
+        self._spans[first, last] = made
+        return made
+
+    @cached_property
+    def _spans(self) -> dict[tuple[int, int], Span]:
+        """The latest of them."""
+        return {}
 
     @property
     def _centre(self) -> Direction:

@@ -87,7 +87,7 @@ class Matrix(Predictor):
             _gaussian_sums(problem, factors, z[..., shaped], sky[:, :, shaped], shaped, axes, uvw, out)
         if factors.outer is not None:
             g = np.broadcast_to(factors.outer[:, :, :, 0], (times, channels, stations, 2, 2))
-            out = mat2.sandwich(g[:, :, problem.antenna1], out, g[:, :, problem.antenna2])
+            out = mat2.between(g, out, problem.antenna1, problem.antenna2)
         return out
 
 

@@ -60,7 +60,8 @@ class TimeSamples:
 
     def spread(self, samples: Complex, out: Complex) -> None:
         """Add to `out` (T, B, C) what lies between samples (N, C)."""
-        _spread(samples, self.rows, self.step, self.begin, self.end, self.offset, kernels(self.taps), out)
+        given = samples.view(float), self.rows, self.step, self.begin, self.end, self.offset  # numbers side by side
+        _spread(*given, kernels(self.taps), out.view(float))
 
     def gather(self, data: Complex) -> Complex:
         """The adjoint of `spread`: samples (N, C) of data (T, B, C)."""
@@ -147,23 +148,39 @@ def kernels(taps: int) -> Float:
 
 
 @compiled(nogil=True, fastmath=FAST, error_model="numpy")
+def windows(uv: Any, one: Any, other: Any, limits: Any, begin: Any, end: Any) -> None:
+    """Fill in where baselines (B,) enter a range of lengths squared, and leave it for good, of stations (T, A, 2)."""
+    for t in range(uv.shape[0]):
+        for b in range(len(one)):
+            u, v = uv[t, one[b], 0] - uv[t, other[b], 0], uv[t, one[b], 1] - uv[t, other[b], 1]
+            length = u * u + v * v
+            if length >= limits[0] and length <= limits[1]:
+                if end[b] == 0:
+                    begin[b] = t
+                end[b] = t + 1
+
+
+@compiled(nogil=True, fastmath=FAST, error_model="numpy")
 def _spread(samples: Any, rows: Any, step: Any, begin: Any, end: Any, offset: Any, kernels: Any, out: Any) -> None:
-    taps = kernels.shape[2]
+    taps, columns = kernels.shape[2], out.shape[2]
+    total = np.empty(columns, samples.dtype)
     for t in range(out.shape[0]):
         for n in range(len(rows)):
             if t < begin[n] or t >= end[n]:
                 continue
-            row, after = rows[n], t - begin[n]
+            after = t - begin[n]
             if step[n] == 1:
-                for c in range(out.shape[2]):
-                    out[t, row, c] += samples[offset[n] + after, c]
+                for c in range(columns):
+                    out[t, rows[n], c] += samples[offset[n] + after, c]
                 continue
             first = after // step[n]
-            phase = after - first * step[n]
+            weights, begun = kernels[step[n], after - first * step[n]], offset[n] + first
+            total[:] = 0.0
             for q in range(taps):
-                w = kernels[step[n], phase, q]
-                for c in range(out.shape[2]):
-                    out[t, row, c] += w * samples[offset[n] + first + q, c]
+                for c in range(columns):
+                    total[c] += weights[q] * samples[begun + q, c]
+            for c in range(columns):
+                out[t, rows[n], c] += total[c]
 
 
 @compiled(nogil=True, fastmath=FAST, error_model="numpy")
