@@ -62,7 +62,13 @@ class BeamNodes:
     def at(self, lm: Float) -> Float:
         """The functions in some directions (S, 2): (K, S)."""
         x, y = (self._terms(lm[:, i] / self.reach[i]) for i in range(2))
-        return np.asarray(np.einsum("sb,kab,sa->ks", y, self.series, x, optimize=True))
+        return self.summed(x, y)
+
+    def summed(self, x: Any, y: Any) -> Any:
+        """Their sums of some values (S, d + 1) of the terms along l and of those along m: (K, S)."""
+        count, orders = self.series.shape[:2]
+        half = x @ np.moveaxis(self.series, 0, 1).reshape(orders, -1).astype(x.dtype)
+        return np.ascontiguousarray((half.reshape(-1, count, orders) @ y[:, :, None])[:, :, 0].T)
 
     def _terms(self, at: Float) -> Float:
         return np.asarray(np.polynomial.chebyshev.chebvander(at, self.series.shape[1] - 1), float)

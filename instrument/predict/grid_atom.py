@@ -6,17 +6,27 @@ Its brother on one grid for all nodes is `separable_atom.py`; tests/accuracy/tes
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from instrument.compiled import compiled
 from instrument.observe.directions import tangents
+from instrument.observe.sampling import Sampling
 from instrument.phasor import FAST
 from instrument.predict.beam_times import BeamTimes
 from instrument.predict.gridding import Gridder
 from instrument.predict.time_samples import TimeSamples
 from instrument.units import Complex, Direction, Float
+
+
+class Span(NamedTuple):
+    """Integrations `begin` to `end` from the first of an atom: stations (N, A, 3) there, the instants of its beams."""
+
+    begin: int
+    end: int
+    stations_m: Float
+    moments: Sampling
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -19,16 +19,15 @@ from instrument import mat2
 from instrument.errors import RefusedError
 from instrument.observe.directions import LIGHT, lmn, offset
 from instrument.observe.grid import ImageGrid
-from instrument.observe.sampling import Sampling
 from instrument.predict.base import EVERY, Predictor, Problem, Work
 from instrument.predict.beam_nodes import ONE, BeamNodes, beam_nodes, heights
 from instrument.predict.beam_times import EACH, BeamTimes, beam_times
-from instrument.predict.grid_atom import Atom, about
+from instrument.predict.grid_atom import Atom, Span, about
 from instrument.predict.gridding import FINEST, Gridder
 from instrument.predict.operator import STOKES, ImageOperator
 from instrument.predict.pairs import picked, placed
 from instrument.predict.rounding import known_gain
-from instrument.predict.separable import Kernels, kernels_for
+from instrument.predict.separable import SIGMA, Kernels, kernels_for
 from instrument.predict.separable_atom import SeparableAtom
 from instrument.predict.time_samples import LONGEST_S, TimeSamples, taps_for, time_samples, windows, with_skirts
 from instrument.sky.image import ImageSky
@@ -43,15 +42,6 @@ FEW = 48  # integrations up to which all are worked out as they are
 NODES, TIMES, BETWEEN, GRIDDING = 0.5, 0.1, 0.15, 0.2  # shares of a tolerance
 ROOT2 = 2**0.5  # the norm of the brightness of 1 Jy
 AnyAtom = Atom | SeparableAtom
-
-
-class Span(NamedTuple):
-    """Integrations `begin` to `end` from the first of an atom: stations (N, A, 3) there, the instants of its beams."""
-
-    begin: int
-    end: int
-    stations_m: Float
-    moments: Sampling
 
 
 class Gridded(Predictor):
@@ -168,9 +158,14 @@ class GriddedImages(ImageOperator):
         atoms = nf * -(-nt // self.atom[0])
         digits = 1 - np.log10(self.accuracy) / 6  # 30 ms at 1e-6 for 480 x 480, with another worker beside
         moments = len(self.instants.instants(0, min(nt, self.atom[0])))
-        seconds = nodes * kinds * (6.5e-8 * digits * pixels * atoms + 2.1e-7 * digits * samples)
-        seconds += 6e-8 * nodes * samples + 8e-7 * atoms * nodes * moments * stations + 1.5e-7 * nt * nf * baselines
-        held = (64 + 16 * kinds + 100 * KEPT) * samples / max(atoms, 1) + 64.0 * stations * nodes * moments
+        if self.kernels is None:
+            seconds = nodes * kinds * (6.5e-8 * digits * pixels * atoms + 2.1e-7 * digits * samples)
+            seconds += 6e-8 * nodes * samples
+        else:  # planes of w, those of 1000 wavelengths
+            planes = self.kernels.deep.width + min(64, 1e3 * SIGMA * self.reach[1])
+            seconds = 5e-8 * planes * kinds * pixels * atoms + self.kernels.seconds(nodes, kinds) * samples
+        seconds += 8e-7 * atoms * nodes * moments * stations + 1.5e-7 * nt * nf * baselines
+        held = (64 + 16 * kinds + 100 * KEPT) * samples / max(atoms, 1) + 2 * 64.0 * stations * nodes * moments
         held += 64.0 * stations * min(nt, self.atom[0]) * 2 + 200.0 * pixels + 2 * 64.0 * nt * nf * baselines
         return Work(2e9 * seconds, 8.0 * nodes * pixels + self.sky.held_bytes(min(nf, 2)), held, seconds)
 
@@ -178,8 +173,7 @@ class GriddedImages(ImageOperator):
         """What is interpolated, for a plan."""
         of = self.problem.shape[0] * self.problem.shape[2]
         text = f"beams at {len(self.nodes)} nodes" if len(self.nodes) > 1 else "no beam differs over the image"
-        if self.instants.step:
-            text += f", every {self.instants.step * self.problem.interval_s:.0f} s"
+        text += f", every {self.instants.step * self.problem.interval_s:.0f} s" if self.instants.step else ""
         if self.between:
             text += f"; {self._count / of:.0%} of the visibilities, the others between"
         return "beams of every pixel", f"{text} (leakage alone {ROOT2 * self.nodes.leakage:.1e})"

@@ -9,7 +9,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import scipy.fft as sf
 
 from instrument.observe.grid import ImageGrid
 from instrument.predict.beam_nodes import BeamNodes
@@ -18,7 +17,6 @@ from instrument.predict.separable import SIGMA, Kernels
 from instrument.predict.separable_loops import Places, Tables, Towards, read, write
 from instrument.predict.time_samples import TimeSamples
 from instrument.units import Complex, Float, Int
-
 
 LARGEST = 6e8  # bytes of a grid
 LANES = 4  # numbers that are worked on side by side
@@ -172,6 +170,8 @@ class SeparableAtom:
 
     def _cells(self, images: Float) -> Float:
         """Cells (nu, nw, nv 2n) of images (n, Ny, Nx); x runs to the west, so that its transform has the other sign."""
+        import scipy.fft as sf
+
         (at_u, ramp_u), (at_v, ramp_v) = self._ramps
         ny, nx = self.grid.pixels
         shape = self._shape(len(images))
@@ -185,6 +185,8 @@ class SeparableAtom:
 
     def _images(self, cells: Float) -> Float:
         """The adjoint of `_cells`: images (n, Ny, Nx)."""
+        import scipy.fft as sf
+
         (at_u, ramp_u), (at_v, ramp_v) = self._ramps
         ny, nx = self.grid.pixels
         planes = cells.view(complex).reshape(len(at_u), cells.shape[1], len(at_v), -1)
