@@ -45,8 +45,8 @@ def contests(imagers: dict[str, Any], form: Form) -> list[Contest]:
 
 def _ways(cls: Any) -> tuple[str, ...]:
     """The ways of an imager to correct for beams."""
-    if cls.through_beams:
-        return get_args(cls.model_fields["way"].annotation) if "way" in cls.model_fields else ("",)
+    if "way" in cls.model_fields:
+        return get_args(cls.model_fields["way"].annotation)
     return ("CLEAN",) if cls.restores and {"cycles", "peaks"} <= set(cls.model_fields) else ()
 
 
