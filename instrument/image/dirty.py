@@ -127,6 +127,7 @@ class Images(ImageSums):
         self.centre: Any = None
         self.clock: Clock | None = None
         self.waiting = 0  # visibilities, in all channels
+        self.together = 1  # channels of a block
 
     def add(self, block: Visibilities) -> None:
         """Add a block."""
@@ -141,6 +142,7 @@ class Images(ImageSums):
         here = [
             self.channels.setdefault(float(freq), _Channel(float(freq), self.imager.pixels)) for freq in block.freq_hz
         ]
+        self.together = max(self.together, len(here))
         for f, channel in enumerate(here):
             if channel.comb is not None and numbers is not None:
                 self._compress(channel, block, f, numbers)
@@ -156,7 +158,12 @@ class Images(ImageSums):
         while sum(channel.samples for channel in self.channels.values()) > max(
             ALL_HELD, len(self.channels) * self._few
         ):
-            self._close(max(self.channels.values(), key=lambda c: c.samples))
+            self._close(full := max(self.channels.values(), key=lambda c: c.samples))
+            full.most = min(full.most, self._share(len(self.channels)))  # if more of it comes, then piece by piece
+
+    def _share(self, channels: int) -> int:
+        """Samples of a channel where so many take turns."""
+        return min(HELD, max(ALL_HELD // channels, self._few))
 
     @property
     def _few(self) -> int:
@@ -168,8 +175,9 @@ class Images(ImageSums):
         if channel.sparse and channel.comb is None:
             assert self.clock is not None
             comb = Comb.of(self.clock, channel.freq_hz, self.imager)
-            channel.most = min(HELD, max(ALL_HELD // len(self.channels), self._few))
-            channel.sparse = comb.span(0, channel.most) is not None
+            # channels that come one after the other, each with all of its times, need not share what may be held
+            channel.most = self._share(self.together)
+            channel.sparse = comb.span(0, self._share(len(self.channels))) is not None
             channel.comb = comb if channel.sparse else None
         if not channel.sparse:
             return self._grid(channel)

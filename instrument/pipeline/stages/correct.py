@@ -31,7 +31,7 @@ class Correct(Stage):
         """Matrices of the stations on both sides of every visibility."""
         if not run.instrument.chain().beams().parts:
             return StageWork("no beam to take out")
-        work = copies(run.visibilities, run.block, 3.0, 0.4e-6, "the beam towards the phase centre taken out")
+        work = copies(run.visibilities, run.block, 2.0, 0.12e-6, "the beam towards the phase centre taken out")
         return work._replace(seconds=work.seconds + BLOCK * len(run.plan.slices))
 
     def start(self, run: Running) -> StageRun:
