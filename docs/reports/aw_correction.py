@@ -1,6 +1,8 @@
 """Leakage of 36 unpolarized sources taken out again: with the beam they were seen through, and with a wrong one.
 
-Run: python docs/reports/aw_correction.py [exact] [wrong]
+Run: python docs/reports/aw_correction.py [exact] [wide] [wrong]
+
+`wide` is `exact` on a grid of 1 deg, down to 10 % power of the beam and below.
 """
 
 from __future__ import annotations
@@ -148,6 +150,12 @@ def exact():
         removed(f"{name}, restored image", made.cube.data[0][:, y, x].T, before, where)
 
 
+def wide():
+    global PIXELS, SKY
+    PIXELS, SKY = 384, instrument.load("skies", "grid", shape=(6, 6), spacing=60 * u.arcmin, flux=10 * u.Jy)
+    exact()
+
+
 def joint_places(plan):
     from astropy.coordinates import SkyCoord
 
@@ -225,8 +233,8 @@ def draw(points):
 
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
-    asked = sys.argv[1:] or ["exact", "wrong"]
+    asked = sys.argv[1:] or ["exact", "wrong", "wide"]  # the last changes the sky
     print(f"{os.cpu_count()} cores\n")
     for what in asked:
-        {"exact": exact, "wrong": wrong}[what]()
+        {"exact": exact, "wrong": wrong, "wide": wide}[what]()
         print()
