@@ -71,7 +71,7 @@ class Gridded(Predictor):
         if problem.shape[0] > FEW and problem.at.regular(problem.interval_s):
             tail = int(taps_for(BETWEEN * share / peak)[0] / 2 * LONGEST_S / problem.interval_s)
             instants = _instants(problem, sky, nodes, (-tail, problem.shape[0] + tail), TIMES * share)
-        sampled = GRIDDING * share / (2 * peak)  # what gridding may be wrong by, summed over the nodes
+        sampled = min(GRIDDING * share / (2 * peak), 1e-2 * nodes.growth)  # gridding may be wrong by, over all nodes
         ready = GriddedImages(
             engine=self,
             problem=problem,
@@ -79,7 +79,7 @@ class Gridded(Predictor):
             nodes=nodes,
             instants=instants,
             between=BETWEEN * share / peak if instants.step else 0.0,
-            accuracy=min(1e-2, sampled / nodes.growth),
+            accuracy=sampled / nodes.growth,
             kernels=kernels_for(nodes, sampled) if len(nodes) > FEW_NODES else None,
         )
         error = nodes.error + 2 * nodes.growth * peak**0.5 * ROOT2 * instants.error
