@@ -71,7 +71,7 @@ class Gridded(Predictor):
         if problem.shape[0] > FEW and problem.at.regular(problem.interval_s):
             tail = int(taps_for(BETWEEN * share / peak)[0] / 2 * LONGEST_S / problem.interval_s)
             instants = _instants(problem, sky, nodes, (-tail, problem.shape[0] + tail), TIMES * share)
-        sampled = min(GRIDDING * share / (2 * peak), 1e-2 * nodes.growth)  # gridding may be wrong by, over all nodes
+        sampled = min(GRIDDING * share / (2 * peak), 1e-2 * nodes.growth)  # the error left to gridding, of all nodes
         ready = GriddedImages(
             engine=self,
             problem=problem,
@@ -83,9 +83,7 @@ class Gridded(Predictor):
             kernels=kernels_for(nodes, sampled) if len(nodes) > FEW_NODES else None,
         )
         error = nodes.error + 2 * nodes.growth * peak**0.5 * ROOT2 * instants.error
-        error += peak * (taps_for(ready.between)[1] if ready.between else 0.0) + 2 * peak * min(
-            sampled, 1e-2 * nodes.growth
-        )
+        error += peak * (taps_for(ready.between)[1] if ready.between else 0.0) + 2 * peak * sampled
         return replace(ready, bound=ROOT2 * max(outer, 1.0) * error, omission=ready.said())
 
     def work(self, problem: Problem) -> Work:
