@@ -1,8 +1,9 @@
 """Gridded: images through beams that differ in time, channel and station, by node images on few samples in time.
 
 V_ab(t) = sum_k J_a(p_k, t) F[c_k B](u_ab(t)) J_b(p_k, t)^H: beams at nodes p_k and functions c_k between them
-(`beam_nodes.py`), a w-gridder for each node and Stokes parameter (`gridding.py`), on as few instants of each baseline
-as it needs (`time_samples.py`). The slow twin is `direct.py`; tests/accuracy/test_gridded.py compares them.
+(`beam_nodes.py`), all node images off one grid (`separable.py`) or by a w-gridder each (`gridding.py`), on as few
+instants of each baseline as it needs (`time_samples.py`). The slow twin is `direct.py`; tests/accuracy/test_gridded.py
+compares them.
 """
 
 from __future__ import annotations
