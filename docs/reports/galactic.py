@@ -44,7 +44,9 @@ def whole(folder):
 
 
 def curve():
-    file = parse(override(read_tables("galactic"), ["observation.frequency.channels=1"]))
+    file = parse(
+        override(read_tables("galactic"), ["observation.frequency.channels=1", "analyze.cube.products=['spectrum-2d']"])
+    )
     problem = file.plan(file.scene()).problem
     due = np.array([definition(problem.block(slice(t, t + 1), slice(0, 1))) for t in LOOKED])
     lines = ""
