@@ -55,7 +55,8 @@ def between(jones: Complex, v: Complex, one: Int, other: Int) -> Complex:
         one = other = np.zeros(len(one), int)
     j = np.array(np.broadcast_to(jones, (*shape, *jones.shape[2:])), complex, order="C")
     v = np.ascontiguousarray(np.broadcast_to(v, out.shape), complex)
-    _between(j.reshape(-1, j.shape[2], 4), v.reshape(-1, len(one), 4), one, other, out.reshape(-1, len(one), 4))
+    if out.size:
+        _between(j.reshape(-1, j.shape[2], 4), v.reshape(-1, len(one), 4), one, other, out.reshape(-1, len(one), 4))
     return out
 
 

@@ -24,11 +24,12 @@ from instrument.predict.base import EVERY, Predictor, Problem, Work
 from instrument.predict.beam_nodes import ONE, BeamNodes, beam_nodes, heights
 from instrument.predict.beam_times import EACH, BeamTimes, beam_times
 from instrument.predict.grid_atom import Atom, Span, about
+from instrument.predict.gridded_work import KEPT, cells_of, work_of
 from instrument.predict.gridding import FINEST, Gridder
 from instrument.predict.operator import STOKES, ImageOperator
 from instrument.predict.pairs import picked, placed
 from instrument.predict.rounding import known_gain
-from instrument.predict.separable import SIGMA, Kernels, kernels_for
+from instrument.predict.separable import Kernels, fits, kernels_for
 from instrument.predict.separable_atom import SeparableAtom
 from instrument.predict.time_samples import LONGEST_S, TimeSamples, taps_for, time_samples, windows, with_skirts
 from instrument.sky.image import ImageSky
@@ -37,7 +38,6 @@ from instrument.units import Complex, Direction, Float, Int, unit_vectors
 from instrument.visibilities import Visibilities
 
 LARGEST_ATOM = 2.6e8  # bytes of the visibilities of one channel that are made at once
-KEPT = 2  # atoms
 FEW_NODES = 3  # up to which each has a gridder of its own
 FEW = 48  # integrations up to which all are worked out as they are
 NODES, TIMES, BETWEEN, GRIDDING = 0.5, 0.1, 0.15, 0.2  # shares of a tolerance
@@ -81,8 +81,9 @@ class Gridded(Predictor):
             instants=instants,
             between=BETWEEN * share / peak if instants.step else 0.0,
             accuracy=sampled / nodes.growth,
-            kernels=kernels_for(nodes, sampled) if len(nodes) > FEW_NODES else None,
         )
+        if len(nodes) > FEW_NODES and (kernels := kernels_for(nodes, sampled)):
+            ready = replace(ready, kernels=kernels if fits(cells_of(ready, kernels)) else None)
         error = nodes.error + 2 * nodes.growth * peak**0.5 * ROOT2 * instants.error
         error += peak * (taps_for(ready.between)[1] if ready.between else 0.0) + 2 * peak * sampled
         return replace(ready, bound=ROOT2 * max(outer, 1.0) * error, omission=ready.said())
@@ -149,24 +150,8 @@ class GriddedImages(ImageOperator):
         return replace(found, flag=flag)
 
     def work(self, times: slice = EVERY, channels: slice = EVERY) -> Work:
-        """Transforms of every node and Stokes parameter, beams at the instants, and what lies between."""
-        nt, nf, baselines = self.block(times, channels).shape
-        stations, pixels, nodes = self.problem.at.shape[2], len(self.sky.grid), len(self.nodes)
-        kinds = sum(self.sky.nonzero(self.problem.at.freq_hz[channels]))
-        samples = float(self._count * nt / self.problem.shape[0]) * nf
-        atoms = nf * -(-nt // self.atom[0])
-        digits = 1 - np.log10(self.accuracy) / 6  # 30 ms at 1e-6 for 480 x 480, with another worker beside
-        moments = len(self.instants.instants(0, min(nt, self.atom[0])))
-        if self.kernels is None:
-            seconds = nodes * kinds * (6.5e-8 * digits * pixels * atoms + 2.1e-7 * digits * samples)
-            seconds += 6e-8 * nodes * samples
-        else:  # planes of w, those of 1000 wavelengths
-            planes = self.kernels.deep.width + min(64, 1e3 * SIGMA * self.reach[1])
-            seconds = 5e-8 * planes * kinds * pixels * atoms + self.kernels.seconds(nodes, kinds) * samples
-        seconds += 8e-7 * atoms * nodes * moments * stations + 1.5e-7 * nt * nf * baselines
-        held = (64 + 16 * kinds + 100 * KEPT) * samples / max(atoms, 1) + 2 * 64.0 * stations * nodes * moments
-        held += 64.0 * stations * min(nt, self.atom[0]) * 2 + 200.0 * pixels + 2 * 64.0 * nt * nf * baselines
-        return Work(2e9 * seconds, 8.0 * nodes * pixels + self.sky.held_bytes(min(nf, 2)), held, seconds)
+        """Of the nodes, the samples and what lies between."""
+        return work_of(self, times, channels)
 
     def said(self) -> tuple[str, str]:
         """What is interpolated, for a plan."""
@@ -280,7 +265,7 @@ class GriddedImages(ImageOperator):
         listed = one.astype(np.int32), other.astype(np.int32), slots.astype(np.int32)
         if self.kernels is not None:
             there = samples, listed, uvw, shift, self.sky.grid, self.nodes, self.kernels, jones, self.instants
-            if (separable := SeparableAtom(*there, threads)).fits:
+            if fits((separable := SeparableAtom(*there, threads)).window[1]):
                 return separable
         gridder = Gridder(uvw, self.sky.grid.pixels, self.sky.grid.pixel, self.accuracy, threads)
         return Atom(samples, listed, gridder, shift, jones, self.instants, span.end - span.begin, self.functions)

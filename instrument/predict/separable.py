@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from instrument.observe.grid import ImageGrid
 from instrument.predict.beam_nodes import BeamNodes
 from instrument.predict.separable_loops import CELLS, POINTS
 from instrument.units import Complex, Float
@@ -22,6 +23,7 @@ SIGMA = 2  # cells as many times as fine as the image asks for
 WIDTHS = (6, 8, 10, 12, 14, 16, 18, 20, 22, 24)
 SAFETY = 2.0  # over the largest error that was looked at
 LOOKED = 3000
+LARGEST = 6e8  # bytes of a grid
 PRODUCT = 2e-10  # seconds, most of it loads and stores
 
 
@@ -105,6 +107,11 @@ class Kernels:
     deep: Kernel
     error: float
 
+    def cells(self, grid: ImageGrid, uv: float, w: float) -> tuple[int, int, int]:
+        """Cells along u, v and w for baselines of up to so many wavelengths."""
+        across = [2 * uv * SIGMA * n * grid.pixel + self.across.width for n in grid.pixels[::-1]]
+        return int(across[0]), int(across[1]), int(w / planes(grid)[1]) + 1 + self.deep.width
+
     def seconds(self, nodes: int, kinds: int) -> float:
         """Of one sample of `kinds` Stokes parameters on one core: its products."""
         width, orders, numbers = self.across.width, self.across.degree + 1, 2 * kinds
@@ -112,12 +119,28 @@ class Kernels:
         return PRODUCT * (cells + nodes * (numbers * orders * (orders + 1) / 2 + 190))
 
 
+def fits(cells: Any) -> bool:
+    """Whether a grid of so many cells along u, v and w, of four Stokes parameters, is small enough."""
+    return 64.0 * float(np.prod(cells, dtype=float)) <= LARGEST
+
+
+def planes(grid: ImageGrid) -> tuple[float, float]:
+    """The middle of n - 1 over an image and the distance of planes of w, in wavelengths."""
+    ny, nx = grid.pixels
+    r2 = np.hypot(nx // 2, ny // 2) ** 2 * grid.pixel**2  # pixel (0, 0) is the farthest
+    middle = min(-r2 / (1 + np.sqrt(1 - r2)) / 2, -1e-9)
+    return float(middle), float(1 / (2 * SIGMA * abs(middle)))
+
+
 def kernels_for(nodes: BeamNodes, wanted: float) -> Kernels | None:
     """The narrowest kernels whose error is at most `wanted`, `None` where none is."""
     rng = np.random.default_rng(0)
     x, off = rng.uniform(-0.5, 0.5, (2, LOOKED, 2))
-    x[: LOOKED // 2] = np.rint(x[: LOOKED // 2]) - 0.5 + 1e-12  # corners
-    x[: LOOKED // 4, 0] = rng.uniform(-0.5, 0.5, LOOKED // 4)  # and edges
+    third = LOOKED // 3
+    x[:third] = 0.5 * np.sign(x[:third])  # corners
+    for axis in range(2):  # and edges
+        edge = slice((1 + axis) * third // 2 + third // 2, (2 + axis) * third // 2 + third // 2)
+        x[edge, axis] = 0.5 * np.sign(x[edge, axis])
     x /= SIGMA
     degree = nodes.series.shape[1] - 1
     due = nodes.at(2 * SIGMA * x * nodes.reach)

@@ -13,12 +13,11 @@ import numpy as np
 from instrument.observe.grid import ImageGrid
 from instrument.predict.beam_nodes import BeamNodes
 from instrument.predict.beam_times import BeamTimes, weights
-from instrument.predict.separable import SIGMA, Kernels
+from instrument.predict.separable import SIGMA, Kernels, planes
 from instrument.predict.separable_loops import Places, Tables, Towards, read, write
 from instrument.predict.time_samples import TimeSamples
 from instrument.units import Complex, Float, Int
 
-LARGEST = 6e8  # bytes of a grid
 LANES = 4  # numbers that are worked on side by side
 
 
@@ -66,13 +65,6 @@ class SeparableAtom:
         widths = np.array([self.kernels.across.width] * 2 + [self.kernels.deep.width])
         return low - widths // 2 + 1, high - low + widths
 
-    @property
-    def fits(self) -> bool:
-        """Whether each cell is there once, and the grid of four Stokes parameters is small enough."""
-        return bool(np.all(self.window[1][:2] <= SIGMA * np.array(self.grid.pixels[::-1]))) and (
-            64.0 * np.prod(self.window[1], dtype=float) <= LARGEST
-        )
-
     def _each(self, parts: Any, work: Any) -> None:
         """Work on some samples at a time, on as many threads as there are."""
         placed = [self._places._replace(order=part) for part in parts if len(part)]
@@ -94,9 +86,7 @@ class SeparableAtom:
 
     @cached_property
     def _depth(self) -> tuple[float, float]:
-        """The middle of n - 1 over the image and the distance of planes of w, in wavelengths."""
-        middle = min(float(self.grid.lmn[:, 2].min()) / 2, -1e-9)
-        return middle, 1 / (2 * SIGMA * abs(middle))
+        return planes(self.grid)
 
     @cached_property
     def _turned(self) -> Any:
@@ -193,9 +183,16 @@ class SeparableAtom:
         out = np.zeros((planes.shape[3], ny, nx))
         for plane, screen in enumerate(self._screens()):
             for s in range(len(out)):
-                tall = np.zeros((SIGMA * ny, len(at_u)), complex)
-                tall[at_v] = (planes[:, plane, :, s] * ramp_u.conj()[:, None]).T * ramp_v.conj()[:, None]
-                wide = np.zeros((ny, SIGMA * nx), complex)
-                wide[:, at_u] = sf.ifft(tall, axis=0, norm="forward", overwrite_x=True)[:ny]
-                out[s] += (screen.conj() * sf.fft(wide, axis=1, overwrite_x=True)[:, :nx]).real
+                tall = _folded((planes[:, plane, :, s] * ramp_u.conj()[:, None]).T * ramp_v.conj()[:, None], at_v, ny)
+                wide = _folded(sf.ifft(tall, axis=0, norm="forward", overwrite_x=True)[:ny].T, at_u, nx)
+                out[s] += (screen.conj() * sf.fft(wide, axis=0, overwrite_x=True)[:nx].T).real
         return out
+
+
+def _folded(cells: Complex, at: Int, pixels: int) -> Complex:
+    """Cells (N, M) added where they are in a transform (SIGMA pixels, M): it comes again and again along u and v."""
+    size = SIGMA * pixels
+    out = np.zeros((size, cells.shape[1]), complex)
+    for first in range(0, len(at), size):
+        out[at[first : first + size]] += cells[first : first + size]
+    return out

@@ -147,7 +147,7 @@ def kernels(taps: int) -> Float:
     return out
 
 
-@compiled(nogil=True, fastmath=FAST, error_model="numpy")
+@compiled(nogil=True, fastmath={"contract"}, error_model="numpy")  # a range may have no end
 def windows(uv: Any, one: Any, other: Any, limits: Any, begin: Any, end: Any) -> None:
     """Fill in where baselines (B,) enter a range of lengths squared, and leave it for good, of stations (T, A, 2)."""
     for t in range(uv.shape[0]):

@@ -132,6 +132,23 @@ def test_blocks_gaps_and_memory_do_not_change_the_images(weighting, monkeypatch,
     assert np.abs(got.psf.data - whole.psf.data).max() < 1e-7
 
 
+def test_channels_that_come_one_after_the_other_are_gridded_once_each(monkeypatch, spans):
+    """They shared what may be held before, and each was gridded in pieces; those that come in turns still are."""
+    vis = visibilities((149, 150, 151, 152))
+    imager = Imager(**SMALL, accuracy=1e-7)
+    whole = imager.image(vis)
+    count = max(len(columns[0]) for _, columns, _ in spans)
+    monkeypatch.setattr(dirty, "HELD", 2 * count)
+    monkeypatch.setattr(dirty, "ALL_HELD", 2 * count)
+    for times, gridded in ((COUNT, range(4, 5)), (COUNT // 5, range(5, 41))):
+        del spans[:]
+        got = imager.image([*blocks_of(vis, times, 1)])
+        assert len(spans) in gridded
+        assert max(len(columns[0]) for _, columns, _ in spans) <= 2 * count
+        assert np.abs(got.data - whole.data).max() < 1e-7
+        assert np.abs(got.psf.data - whole.psf.data).max() < 1e-7
+
+
 def test_times_without_order_and_given_uvw_are_gridded_as_they_are(random, spans):
     imager = Imager(**SMALL, accuracy=1e-7)
     given = replace(random, given_uvw_m=random.uvw_m)

@@ -55,6 +55,24 @@ def test_sandwich_keeps_a_hermitian_matrix_hermitian():
     np.testing.assert_allclose(found, mat2.herm(found), atol=1e-13)
 
 
+@pytest.mark.parametrize(("times", "channels", "stations", "baselines"), [(3, 2, 4, 5), (3, 1, 1, 5), (2, 2, 3, 0)])
+def test_matrices_of_stations_are_taken_to_their_baselines(times, channels, stations, baselines):
+    """As `sandwich` of the matrices picked out; one for all stations, one for all times, none at all."""
+    rng = np.random.default_rng(3)
+    jones = rng.standard_normal((times, 1, stations, 2, 2, 2)).view(complex)[..., 0]
+    v = rng.standard_normal((times, channels, baselines, 2, 2, 2)).view(complex)[..., 0]
+    one, other = rng.integers(max(stations, 4), size=(2, baselines))
+    a, b = (np.zeros(baselines, int) if stations == 1 else p for p in (one, other))
+    for j in (jones, jones[:1]):
+        due = mat2.sandwich(j[:, :, a], v, j[:, :, b])
+        found = mat2.between(j, v, one, other)
+        assert found.shape == due.shape == v.shape
+        np.testing.assert_allclose(found, due, rtol=0, atol=1e-14 * np.abs(due).max(initial=1.0))
+    if baselines:
+        v[1, 0, 2] = np.nan
+        assert np.isnan(mat2.between(jones, v, one, other)).sum() == 4
+
+
 def test_inverse_of_a_known_matrix():
     np.testing.assert_allclose(mat2.inverse(np.array([[1, 2], [3, 4 + 0j]])), [[-2, 1], [1.5, -0.5]], rtol=1e-15)
 
