@@ -72,6 +72,7 @@ def parser() -> argparse.ArgumentParser:
     cases.add_argument("what", metavar="WHAT", nargs="?", help="a scene, a kind of plugins, a plugin (default: all)")
     cases.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings", help="of the plugin")
     _add_out(cases, "folder to write stress.ecsv into, new or empty (default: none is written)")
+    _add_paper(verbs)
     verbs.add_parser("scenes", help="List the shipped scenes.")
     plugins = verbs.add_parser("plugins", help="List the plugins, and what is broken; with a NAME its settings.")
     plugins.add_argument("name", metavar="NAME", nargs="?", help="a plugin: its settings, their units and defaults")
@@ -89,6 +90,15 @@ def _add_out(verb: argparse.ArgumentParser, text: str = "") -> None:
     usual = "folder to write, new or empty (default: runs/NAME, or NAME-2, NAME-3, ... where that is taken)"
     verb.add_argument("--out", metavar="DIR", help=f"{text or usual}; nothing that is there is overwritten")
     verb.add_argument("--force", action="store_true", help="replace an earlier run in that folder")
+
+
+def _add_paper(verbs: Any) -> None:
+    text = "Run what Asad et al. (2015) did: the paper's numbers, ours, and why they differ."
+    verb = verbs.add_parser("paper", help=text, description=text)
+    verb.add_argument("experiments", metavar="EXPERIMENT", nargs="*", help="beam, di-errors, ... (default: all)")
+    verb.add_argument("--quick", action="store_true", help="a smaller form of each, minutes for all")
+    verb.add_argument("--seed", type=int, metavar="N", help="of all that is drawn (default: those of the scenes)")
+    _add_out(verb, "folder to write, new or empty (default: runs/paper, or the next free name)")
 
 
 def _add_analyze(verbs: Any) -> None:
@@ -269,6 +279,16 @@ def _stress(given: argparse.Namespace) -> int:
     return DONE if right else FELL_SHORT
 
 
+def _paper(given: argparse.Namespace) -> int:
+    import shlex
+
+    from instrument.paper.command import paper
+
+    command = shlex.join(["instrument", *given.words])
+    done = paper(given.experiments, given.quick, given.seed, given.out, show, given.force, command)
+    return DONE if done else FELL_SHORT
+
+
 def _scenes(given: argparse.Namespace) -> int:
     from instrument.pipeline.scene_text import shipped
 
@@ -310,6 +330,7 @@ VERBS = {
     "compare": _compare,
     "precision": _precision,
     "stress": _stress,
+    "paper": _paper,
     "scenes": _scenes,
     "plugins": _plugins,
     "doctor": _doctor,

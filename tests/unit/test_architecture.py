@@ -58,6 +58,7 @@ LAYERS = (
     ("conformance",),
     ("precision",),
     ("stress",),
+    ("paper",),
     ("doctor",),
     ("",),  # `instrument` itself, which looks names up in all of them when they are first used
     ("cli",),

@@ -1,0 +1,28 @@
+"""The experiments by name, in the order of the paper; a new one is a line here and a file with a function `run`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib import import_module
+
+from instrument.errors import InputError, did_you_mean
+from instrument.paper.bench import Experiment
+
+# name: module in this package, title, where in the paper
+EXPERIMENTS = {
+    "beam": ("beam", "Mueller matrices of a baseline over the sky, their width and their leakage", "section 2"),
+}
+
+
+def chosen(names: Sequence[str]) -> list[str]:
+    """The names asked for, or all; raises `InputError` for one that is none."""
+    for name in names:
+        if name not in EXPERIMENTS:
+            raise InputError(f"no experiment is called '{name}': {did_you_mean(name, EXPERIMENTS)}")
+    return list(dict.fromkeys(names)) or list(EXPERIMENTS)
+
+
+def experiment(name: str) -> Experiment:
+    """The function that runs an experiment."""
+    run: Experiment = import_module(f"instrument.paper.{EXPERIMENTS[name][0]}").run
+    return run
