@@ -93,9 +93,11 @@ def _add_out(verb: argparse.ArgumentParser, text: str = "") -> None:
 
 
 def _add_paper(verbs: Any) -> None:
+    from instrument.paper.experiments import EXPERIMENTS
+
     text = "Run what Asad et al. (2015) did: the paper's numbers, ours, and why they differ."
     verb = verbs.add_parser("paper", help=text, description=text)
-    verb.add_argument("experiments", metavar="EXPERIMENT", nargs="*", help="beam, di-errors, ... (default: all)")
+    verb.add_argument("experiments", metavar="EXPERIMENT", nargs="*", help=f"{', '.join(EXPERIMENTS)} (default: all)")
     verb.add_argument("--quick", action="store_true", help="a smaller form of each, minutes for all")
     verb.add_argument("--seed", type=int, metavar="N", help="of all that is drawn (default: those of the scenes)")
     _add_out(verb, "folder to write, new or empty (default: runs/paper, or the next free name)")

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from importlib import import_module
+from typing import TYPE_CHECKING
 
 from instrument.errors import InputError, did_you_mean
-from instrument.paper.bench import Experiment
+
+if TYPE_CHECKING:  # the command line reads the names: nothing heavy is loaded for them
+    from instrument.paper.bench import Experiment
 
 # name: module in this package, title, where in the paper
 EXPERIMENTS = {
     "beam": ("beam", "Mueller matrices of a baseline over the sky, their width and their leakage", "section 2"),
+    "ixr": ("ixr", "Leakage in dB, what must be removed, and the IXR of telescopes over their fields", "discussion"),
 }
 
 

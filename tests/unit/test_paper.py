@@ -1,0 +1,151 @@
+"""`instrument paper`: verdicts, tables, the page, two folders compared; the experiment `ixr` whole."""
+
+import json
+
+import numpy as np
+import pytest
+from astropy.table import Table
+
+from instrument import mueller
+from instrument.cli import main
+from instrument.paper import command, ixr
+from instrument.paper.bench import Bench
+from instrument.paper.experiments import EXPERIMENTS, experiment
+from instrument.paper.finding import AGREES, DIFFERS, MORE, NOT, Finding, verdict
+from instrument.paper.patch import around, rings, square
+from instrument.units import Direction
+
+SOUND = Finding("width", 3.8, "deg", "3.8", (3.7, 3.9))
+WHY = Finding("length", 129.0, "m", "127", (126.5, 127.5), "by survey 129.0 m", "130 m")
+MISSED = Finding("leakage", 0.5, "%", "0.3", (0.2, 0.4))
+BEYOND = Finding("depth", 7.0, "rad/m2")
+
+
+def test_a_number_agrees_within_its_range_and_else_needs_a_reason():
+    assert [f.agreement for f in (SOUND, WHY, MISSED, BEYOND)] == [AGREES, DIFFERS, NOT, MORE]
+    assert SOUND._replace(ours=3.9).agreement == AGREES and SOUND._replace(ours=3.9001).agreement == NOT
+    assert SOUND._replace(ours=float("nan")).agreement == NOT
+    assert SOUND._replace(because="no reason is needed").agreement == AGREES
+
+
+def test_the_verdict_is_that_of_the_worst_number():
+    assert verdict([SOUND, BEYOND]) == "reproduced"
+    assert verdict([SOUND, WHY, BEYOND]) == "reproduced, 1 of 2 with a reason for the difference"
+    assert verdict([SOUND, WHY, MISSED]) == "not reproduced: leakage"
+    assert verdict([BEYOND]).startswith("beyond the paper")
+
+
+def findings(*given):
+    def run(bench):
+        from matplotlib.figure import Figure
+
+        figure = Figure()
+        figure.subplots().plot([0, bench.seed or 1])
+        bench.draw("line", figure, "A line.")
+        return list(given)
+
+    return run
+
+
+@pytest.fixture
+def scripted(monkeypatch):
+    """Experiments replaced by lists of findings."""
+
+    def script(**given):
+        monkeypatch.setattr(command, "experiment", lambda name: findings(*given[name]))
+        for name in given:
+            monkeypatch.setitem(EXPERIMENTS, name, (name, f"title of {name}", "section 9"))
+
+    return script
+
+
+def test_a_folder_has_the_record_the_tables_the_text_and_the_page(tmp_path, scripted, capsys):
+    scripted(one=[SOUND, WHY], two=[BEYOND])
+    assert main(["paper", "one", "two", "one", "--quick", "--seed", "5", "--out", str(tmp_path / "p")]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert [line for line in said if line.startswith("one:")][-1].startswith("one: reproduced, 1 of 2")
+    assert sum(line.startswith("one: title") for line in said) == 1  # asked for twice, run once
+    what = json.loads((tmp_path / "p" / "run.json").read_text())
+    assert what["numbers"] == {"one": {"width": 3.8, "length": 129.0}, "two": {"depth": 7.0}}
+    assert (what["form"], what["seed"]) == ("quick", 5) and what["memory"]["two"] > 1e7
+    assert what["command"].startswith("instrument paper one two one --quick")
+    table = Table.read(tmp_path / "p" / "one.ecsv")
+    assert list(table["agreement"]) == [AGREES, DIFFERS] and table["low"][1] == 126.5
+    assert np.isnan(Table.read(tmp_path / "p" / "two.ecsv")["high"][0])
+    text = (tmp_path / "p" / "paper.md").read_text()
+    assert "### `one`: title of one" in text and "| width | 3.80 deg | 3.8 | agrees |" in text
+    assert "| length | 129 m | 127 | differs, for a reason; by survey 129.0 m; 130 m |" in text
+    page = (tmp_path / "p" / "paper.html").read_text()
+    assert "Every number is reproduced" in page and "by survey 129.0 m" in page and "A line." in page
+    assert (tmp_path / "p" / "one" / "line.png").stat().st_size > 1000
+
+
+def test_a_number_that_is_not_reproduced_is_status_3(tmp_path, scripted, capsys):
+    scripted(one=[MISSED])
+    assert main(["paper", "one", "--out", str(tmp_path / "p")]) == 3
+    assert "one: not reproduced: leakage" in capsys.readouterr().out
+    assert "1 not reproduced" in (tmp_path / "p" / "paper.html").read_text()
+
+
+def test_two_folders_are_compared(tmp_path, scripted, capsys):
+    for name, width in (("a", 3.8), ("b", 3.9)):
+        scripted(one=[SOUND._replace(ours=width), WHY])
+        assert main(["paper", "one", "--out", str(tmp_path / name)]) == 0
+    capsys.readouterr()
+    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "b")]) == 0
+    numbers = [line for line in capsys.readouterr().out.splitlines() if line.startswith("numbers")]
+    assert len(numbers) == 1 and "width" in numbers[0] and "3.8" in numbers[0] and "3.9" in numbers[0]
+
+
+@pytest.mark.parametrize(("word", "said"), [("bem", "did you mean 'beam'?"), ("nothing-of-it", "known: ")])
+def test_an_unknown_experiment_is_one_line_and_leaves_nothing(tmp_path, capsys, word, said):
+    assert main(["paper", "ixr", word, "--out", str(tmp_path / "p")]) == 2
+    err = capsys.readouterr().err
+    assert f"no experiment is called '{word}'" in err and said in err and err.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_its_help_lists_the_experiments(capsys):
+    assert main(["paper", "--help"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert f"{', '.join(EXPERIMENTS)} (default: all)" in text
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_experiment_is_there(name):
+    assert callable(experiment(name))
+
+
+def test_the_bench_gives_its_seed_to_scenes(tmp_path):
+    assert Bench(tmp_path, seed=7).tables("di-errors")["seed"] == 7
+    assert Bench(tmp_path).tables("di-errors", "sky.flux=1 Jy")["sky"]["flux"] == "1 Jy"
+    assert (Bench(tmp_path, True).choose(1, 2), Bench(tmp_path).choose(1, 2)) == (1, 2)
+
+
+def test_patches_and_rings_are_where_they_say():
+    centre = Direction(1.0, 0.8)
+    l, m = rings(np.array([2.0, 5.0]), np.array([0.0, 90.0]))
+    away = around(centre, l, m).separation(centre.skycoord).deg
+    assert away == pytest.approx([2, 2, 5, 5], abs=1e-9)
+    assert l[1] > 0 and abs(m[1]) < 1e-12 and m[0] > 0  # north first, then east
+    l, m = square(5, 10.0)
+    assert len(l) == 25 and l[0] == m[0] == -np.sin(np.deg2rad(10)) and m[4] == m[0] and l[4] == -l[0]
+
+
+def test_the_experiment_ixr_whole(tmp_path, capsys):
+    """The whole verb; and its maps against leakages of Mueller matrices: IXR_M is one over the largest."""
+    assert main(["paper", "ixr", "--quick", "--out", str(tmp_path / "p")]) == 0
+    assert "NOT REPRODUCED" not in capsys.readouterr().out
+    numbers = json.loads((tmp_path / "p" / "run.json").read_text())["numbers"]["ixr"]
+    worst = numbers["LOFAR HBA, 150 MHz, transit: IXR_M in the main beam, worst"]
+    assert worst == pytest.approx(27.5, abs=0.5)  # 0.18 % at 2 deg, worst direction: EveryBeam's too
+    assert numbers["Airy dish of 25 m, 4 h before: largest leakage in the main beam"] == 0
+
+
+def test_stations_of_the_experiment_ixr_leak_what_they_should():
+    for leaks in (0.003, 0.03, 0.3):
+        m = mueller.mueller(*[ixr._station(leaks)] * 2).real
+        assert np.linalg.norm(m[0, 1:]) / m[0, 0] == pytest.approx(leaks, rel=1e-12)
+        left = mueller.mueller(*[ixr._power(ixr._station(leaks), 0.3)] * 2).real
+        # tanh(0.3 artanh d): 0.3 d for a small d
+        assert np.linalg.norm(left[0, 1:]) / left[0, 0] == pytest.approx(np.tanh(0.3 * np.arctanh(leaks)), rel=1e-12)
