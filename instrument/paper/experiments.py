@@ -15,6 +15,7 @@ if TYPE_CHECKING:  # the command line reads the names: nothing heavy is loaded f
 EXPERIMENTS = {
     "beam": ("beam", "Mueller matrices of a baseline over the sky, their width and their leakage", "section 2"),
     "ixr": ("ixr", "Leakage in dB, what must be removed, and the IXR of telescopes over their fields", "discussion"),
+    "errata": ("errata", "Slips of the paper: the printed form beside the right one", "formulae and tables"),
 }
 
 

@@ -9,14 +9,12 @@ from matplotlib.figure import Figure
 
 from instrument.analyze.ixr import ixr_of_leakage, leakage_of_ixr
 from instrument.jones.mueller import ixr_jones, ixr_mueller, leakage, mueller
-from instrument.observe.directions import earth_frame
-from instrument.observe.layout import Layout
 from instrument.paper.bench import Bench
 from instrument.paper.finding import Finding
-from instrument.paper.patch import around, from_transit, square
+from instrument.paper.patch import around, from_transit, square, zenith
 from instrument.registry import load
 from instrument.report.style import BLUE, GREY, ORANGE, styled
-from instrument.units import Complex, Direction, Float
+from instrument.units import Complex, Float
 
 LEAKAGE = 0.003  # the paper's, of which 70 % is removed
 LEFT = 0.3
@@ -52,10 +50,10 @@ def run(bench: Bench) -> list[Finding]:
 
 
 def _of_paper() -> list[Finding]:
-    station = _station(LEAKAGE)
-    m, j = _db(ixr_mueller(station)), _db(ixr_jones(station))
-    at_25 = _station(float(leakage_of_ixr(25.0)))
-    better = _power(at_25, LEFT)  # 70 % of its leakage removed
+    leaking = station(LEAKAGE)
+    m, j = _db(ixr_mueller(leaking)), _db(ixr_jones(leaking))
+    at_25 = station(float(leakage_of_ixr(25.0)))
+    better = corrected(at_25, LEFT)  # 70 % of its leakage removed
     m_25, m_left = _db(ixr_mueller(at_25)), _db(ixr_mueller(better))
     step = _db(ixr_jones(better)) - _db(ixr_jones(at_25))
     printed = f"{step:.1f} dB is the step in IXR_J of the same two stations; in IXR_M it is {m_left - m_25:.1f} dB"
@@ -77,7 +75,7 @@ def _of_paper() -> list[Finding]:
     return found
 
 
-def _station(leaks: float) -> Complex:
+def station(leaks: float) -> Complex:
     """A Jones matrix whose largest leakage out of I is this: dipoles of unlike gain, turned and tilted."""
     k = np.sqrt((1 + leaks) / (1 - leaks))
     turn = np.array([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]])
@@ -85,7 +83,7 @@ def _station(leaks: float) -> Complex:
     return np.asarray(turn @ np.diag([k, 1.0]) @ tilt)
 
 
-def _power(jones: Complex, share: float) -> Complex:
+def corrected(jones: Complex, share: float) -> Complex:
     """The station after a correction that leaves a share of its leakage, J to a power of its singular values."""
     left, s, right = np.linalg.svd(jones)
     return np.asarray(left @ np.diag(s**share) @ right)
@@ -132,7 +130,7 @@ def _map(bench: Bench, view: View, pixels: int) -> Map:
     l, m = square(pixels, half)
     on_sky = np.hypot(l, m) < 1
     if view.whole_sky:
-        centre = _zenith(layout, when)
+        centre = zenith(layout, when)
     state = "absolute" if view.whole_sky else "differential"
     where = around(centre, l[on_sky], m[on_sky])
     jones = telescope.beam(where, when, view.freq_hz * u.Hz, pointing=centre.skycoord, state=state)[:, 0]  # (T, A, S)
@@ -150,12 +148,6 @@ def _map(bench: Bench, view: View, pixels: int) -> Map:
 def _total(matrices: Complex) -> Float:
     linear, circular = leakage(matrices)
     return np.hypot(linear, circular)
-
-
-def _zenith(layout: Layout, when: Any) -> Direction:
-    """The ICRS direction that the first station faces, without aberration."""
-    x, y, z = earth_frame(when, layout.positions_m[0]).matrices[0].T @ layout.axes[0, 2]
-    return Direction(float(np.arctan2(y, x)), float(np.arcsin(z)))
 
 
 def _of_map(one: Map) -> list[Finding]:

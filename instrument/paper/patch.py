@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from instrument.observe.directions import offset
+from instrument.observe.directions import earth_frame, offset
 from instrument.observe.layout import Layout
 from instrument.observe.observation import Observation
 from instrument.units import Direction, Float
@@ -40,3 +40,9 @@ def from_transit(observation: Observation, layout: Layout, hours: Any) -> Any:
 
     night = observation.times(layout)
     return night[0] + (night[-1] - night[0]) / 2 + np.asarray(hours) / SIDEREAL * u.hour
+
+
+def zenith(layout: Layout, when: Any) -> Direction:
+    """The ICRS direction that the first station faces, without aberration."""
+    x, y, z = earth_frame(when, layout.positions_m[0]).matrices[0].T @ layout.axes[0, 2]
+    return Direction(float(np.arctan2(y, x)), float(np.arcsin(z)))

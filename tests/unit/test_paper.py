@@ -144,8 +144,8 @@ def test_the_experiment_ixr_whole(tmp_path, capsys):
 
 def test_stations_of_the_experiment_ixr_leak_what_they_should():
     for leaks in (0.003, 0.03, 0.3):
-        m = mueller.mueller(*[ixr._station(leaks)] * 2).real
+        m = mueller.mueller(*[ixr.station(leaks)] * 2).real
         assert np.linalg.norm(m[0, 1:]) / m[0, 0] == pytest.approx(leaks, rel=1e-12)
-        left = mueller.mueller(*[ixr._power(ixr._station(leaks), 0.3)] * 2).real
+        left = mueller.mueller(*[ixr.corrected(ixr.station(leaks), 0.3)] * 2).real
         # tanh(0.3 artanh d): 0.3 d for a small d
         assert np.linalg.norm(left[0, 1:]) / left[0, 0] == pytest.approx(np.tanh(0.3 * np.arctanh(leaks)), rel=1e-12)
