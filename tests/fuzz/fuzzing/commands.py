@@ -131,6 +131,7 @@ CATALOGUE_NAMES = [
 VERBS = [
     *(["analyze"], ["analyze", ""], ["run"], [], ["x"], ["plan", "s.toml", "s.toml"], ["analyze", "x" * 5000]),
     *(["analyze", "/"], ["analyze", "/etc/passwd"], ["doctor", "x"], ["plugins", "--x"], ["plugins", "os"]),
+    *(["paper", "x"], ["paper", "ixr", ""], ["paper", "--seed", "x"], ["paper", "ixr", "--seed"]),
     *(["plugins", "dipole"], ["scenes", "x"], ["-"], ["--"], ["\x1b[31m"], ["plan", "mock-grid", "--set"]),
 ]
 
