@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +12,7 @@ from matplotlib.figure import Figure
 
 from instrument.paper.finding import Finding
 from instrument.pipeline.record import Result
-from instrument.pipeline.run import run
+from instrument.pipeline.run import computed, run
 from instrument.pipeline.scene_file import parse
 from instrument.pipeline.scene_text import override, read_tables
 from instrument.report.page import FigureEntry
@@ -38,11 +37,11 @@ class Bench:
         return override(read_tables(name), [*settings, *own])
 
     def run(self, name: str, *settings: str, keep: str = "") -> Result:
-        """A shipped scene run whole; its folder is kept under a name, or is gone at the end."""
+        """A shipped scene run whole; its folder is written where a name is given to keep it under."""
         tables = self.tables(name, *settings)
-        with tempfile.TemporaryDirectory(dir=self.folder) as aside:
-            out = self.folder / keep if keep else Path(aside) / "run"
-            return run(parse(tables), tables, out=str(out), verify=not self.quick)
+        if not keep:
+            return computed(parse(tables), verify=not self.quick)
+        return run(parse(tables), tables, out=str(self.folder / keep), verify=not self.quick)
 
     def draw(self, name: str, drawing: Figure | Axes, caption: str, wide: bool = False) -> None:
         """Write a figure NAME.png, and show it in the page."""

@@ -46,14 +46,20 @@ def run(
         show(str(result.whole))
         with folder, progress_bar(scene_file.name) as progress:
             _compute(result, progress)
-            if verify:
-                result.check = result.plan.check
-                _book(result)
             progress(1 - result.whole.share(WRITE) if result.whole else 1.0, WRITE)
             with result.timed(WRITE), provenance(**_known(result)):
                 _write(result, tables, folder.partial)
             result.folder = folder.finish()
     show(summary(result))
+    return result
+
+
+def computed(scene_file: SceneFile, verify: bool = True) -> Result:
+    """A scene file run end to end in memory: nothing is written."""
+    with unused_ledger() as ledger:
+        result = _planned(scene_file, Path(), None, None, verify)
+        result.unused = ledger
+        _compute(result, lambda done, name: None)
     return result
 
 
@@ -91,6 +97,9 @@ def _compute(result: Result, progress: Progress) -> None:
     assert result.whole is not None
     stream(run, result.timed, progress, result.whole.share)
     result.stages = run.results
+    if result.plan.checker:
+        result.check = result.plan.check
+        _book(result)
 
 
 def stream(
