@@ -14,8 +14,8 @@ if TYPE_CHECKING:  # the command line reads the names: nothing heavy is loaded f
 # name: module in this package, title, where in the paper
 EXPERIMENTS = {
     "beam": ("beam", "Mueller matrices of a baseline over the sky, their width and their leakage", "section 2"),
-    "di-errors": ("di_errors", "Gain and feed errors solved on 25 sources, the seven parameters left", "self-calibration"),
-    "mock-grid": ("mock_grid", "Leakage of a grid of unpolarized sources, and calibration on its centre", "mock observation"),
+    "di-errors": ("di_errors", "Gain and feed errors solved on 25 sources: seven parameters", "self-calibration"),
+    "mock-grid": ("mock_grid", "Leakage of a grid of unpolarized sources; its centre alone", "mock observation"),
     "3c196": ("field_3c196", "Leakage of the 3C196 field: its brightest sources, its spectra", "field of 3C196"),
     "incomplete-model": ("incomplete_model", "Calibration on 1 to 1000 of 4567 sources", "incomplete models"),
     "ixr": ("ixr", "Leakage in dB, what must be removed, and the IXR of telescopes over their fields", "discussion"),
