@@ -61,6 +61,8 @@ def test_leakage_of_the_grid(tmp_path):
     rings = [grid[f"I to linear, {a:g} to {b:g} deg, median"].ours for a, b in ((0.1, 1), (1, 2), (2, 3), (3, 4))]
     assert rings == pytest.approx([0.23, 0.41, 0.62, 0.89], rel=0.08)
     assert grid["I to linear within 4 deg, median"].agreement == DIFFERS
+    width = grid["width (FWHM) by the fluxes of the grid"]
+    assert width.ours == pytest.approx(4.0, abs=0.05) and "3.85 deg" in width.because  # 3.85 at transit by `beam`
     # stations follow 2/59 of what is not in the model
     lost = -grid["centre alone in the model: flux of others in 3 deg, median"].ours
     assert lost == pytest.approx(200 / 59, rel=0.25)
