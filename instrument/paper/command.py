@@ -57,6 +57,8 @@ def paper(
             bench.folder.mkdir()
             begin = time.perf_counter()
             findings = experiment(name)(bench)
+            if len({f.what for f in findings}) < len(findings):
+                raise ValueError(f"{name}: two findings are called the same, and run.json has them by name")
             spent = time.perf_counter() - begin
             outcomes.append(Outcome(name, findings, bench.figures, spent, high_water()))
             show("\n".join(lines(outcomes[-1])))

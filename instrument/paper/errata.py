@@ -270,13 +270,13 @@ def _psf(bench: Bench) -> list[Finding]:
     psf = load("imagers", "dirty", pixels=256, pixel=0.6 * u.arcmin, uv_range=(30, 800)).psf(visibilities)
     sizes = 60 * np.rad2deg([psf.major_rad[0], psf.minor_rad[0]])
     mean = float(np.sqrt(sizes.prod()))
-    text = (
-        f"{sizes[0]:.2f} x {sizes[1]:.2f} arcmin, natural weights, 30 to 800 wavelengths; in K per Jy/beam the printed"
-    )
-    return [
-        _slip("12. PSF", mean, "arcmin", printed, value, f"{text} is {_percent((mean / value) ** 2, 1.0)}")
-        for printed, value in (("3 (caption)", 3.0), ("4.3 (table)", 4.3))
-    ]  # fmt: skip
+    text = f"{sizes[0]:.2f} x {sizes[1]:.2f} arcmin, natural weights, 30 to 800 wavelengths; the printed K per Jy/beam"
+    found = []
+    for where, printed in (("caption", "3"), ("table", "4.3")):
+        wrong = float(printed)
+        because = f"{text} is {_percent((mean / wrong) ** 2, 1)}"
+        found.append(_slip(f"12. PSF, beside the {where}", mean, "arcmin", printed, wrong, because))
+    return found
 
 
 def _density(bench: Bench) -> list[Finding]:

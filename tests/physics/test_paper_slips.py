@@ -10,7 +10,9 @@ from instrument.paper.finding import DIFFERS
 
 @pytest.mark.long
 def test_every_slip_is_shown_to_be_one(tmp_path):
-    found = {f.what: f for f in errata.run(Bench(tmp_path, quick=True))}
+    every = errata.run(Bench(tmp_path, quick=True))
+    found = {f.what: f for f in every}
+    assert len(found) == len(every)  # run.json has them by name
     assert {f.agreement for f in found.values()} == {DIFFERS}
     assert {int(what.split(".")[0]) for what in found} == set(range(1, 14))
     ours = {what.split(".")[0]: f.ours for what, f in found.items()}
