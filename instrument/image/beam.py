@@ -179,6 +179,7 @@ class BeamImager(SolvingImager):
         grid = self.grid(block.phase_centre)
         operator = operator or self._plain(block, grid)
         operator.demand(grid, self.uv_range)
+        operator = operator.within(self.uv_range)
         known, whole = _known(block), block.effective_weight.any()
         block, centre = _without_centre(block, operator.problem.chain, known)
         weight = correlations.whole(block.effective_weight, known) * np.ones(block.data.shape[:3])

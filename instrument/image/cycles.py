@@ -112,7 +112,7 @@ class Cycles:
         forward: Forward = Degridded(first.grid, imager.accuracy, imager.uv_range)
         if self.operator is not None:
             self.operator.demand(first.grid, imager.uv_range)
-            forward = Operated(self.operator)
+            forward = Operated(self.operator.within(imager.uv_range))
         hunts = self._hunts(first, weights, response)
         for _ in range(imager.cycles):
             if not self._minor(hunts, residual, model, response):

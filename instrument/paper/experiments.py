@@ -13,11 +13,14 @@ if TYPE_CHECKING:  # the command line reads the names: nothing heavy is loaded f
 
 # name: module in this package, title, where in the paper
 EXPERIMENTS = {
-    "beam": ("beam", "Mueller matrices of a baseline over the sky, their width and their leakage", "section 2"),
+    "beam": ("beam", "Mueller matrices of a baseline over the sky, their width and their leakage", "beam"),
     "di-errors": ("di_errors", "Gain and feed errors solved on 25 sources: seven parameters", "self-calibration"),
     "mock-grid": ("mock_grid", "Leakage of a grid of unpolarized sources; its centre alone", "mock observation"),
     "3c196": ("field_3c196", "Leakage of the 3C196 field: its brightest sources, its spectra", "field of 3C196"),
     "incomplete-model": ("incomplete_model", "Calibration on 1 to 1000 of 4567 sources", "incomplete models"),
+    "aw-correction": ("aw_correction", "Leakage taken out by beam-corrected imaging", "A-projection"),
+    "galactic": ("galactic", "The polarized Galaxy leaked into I, and the window on the signal", "Galactic emission"),
+    "gmca": ("gmca", "Leaked polarization removed, and the signal that goes with it", "foreground removal"),
     "ixr": ("ixr", "Leakage in dB, what must be removed, and the IXR of telescopes over their fields", "discussion"),
     "errata": ("errata", "Slips of the paper: the printed form beside the right one", "formulae and tables"),
 }

@@ -12,7 +12,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -82,8 +82,7 @@ class Gridded(Predictor):
             between=BETWEEN * share / peak if instants.step else 0.0,
             accuracy=sampled / nodes.growth,
         )
-        if len(nodes) > FEW_NODES and (kernels := kernels_for(nodes, sampled)):
-            ready = replace(ready, kernels=kernels if fits(cells_of(ready, kernels)) else None)
+        ready = ready.with_kernels()
         error = nodes.error + 2 * nodes.growth * peak**0.5 * ROOT2 * instants.error
         error += peak * (taps_for(ready.between)[1] if ready.between else 0.0) + 2 * peak * sampled
         return replace(ready, bound=ROOT2 * max(outer, 1.0) * error, omission=ready.said())
@@ -106,6 +105,16 @@ class GriddedImages(ImageOperator):
     def __getstate__(self) -> dict[str, Any]:
         """What goes to another process: what was decided, and nothing that can be made again there."""
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
+
+    def within(self, uv_range: tuple[float, float] | None) -> Self:
+        """The operator of these visibilities alone; short baselines may do with one grid where all could not."""
+        found = super().within(uv_range)
+        return found if found is self else found.with_kernels()
+
+    def with_kernels(self) -> Self:
+        """With one grid for all nodes, where they are many and it is small enough."""
+        kernels = kernels_for(self.nodes, self.accuracy * self.nodes.growth) if len(self.nodes) > FEW_NODES else None
+        return replace(self, kernels=kernels if kernels and fits(cells_of(self, kernels)) else None)
 
     def forward(self, images: Float, times: slice, channels: slice, pairs: tuple[Int, Int] | None = None) -> Complex:
         """A x: visibilities in Jy, complex (T, F, B, 2, 2); 0 outside the uv range of the problem."""

@@ -11,6 +11,7 @@ from instrument.predict.base import Work
 from instrument.predict.separable import Kernels
 
 KEPT = 2  # atoms
+LOOKED = 16  # times at which it is looked how far w goes
 BACK = 1.4  # of a uv range: baselines leave it, and come back
 
 
@@ -43,4 +44,11 @@ def cells_of(ready: Any, kernels: Kernels) -> tuple[int, int, int]:
     places = at.layout.positions_m
     longest = np.linalg.norm(places[problem.antenna1] - places[problem.antenna2], axis=-1).max(initial=0.0)
     w = float(longest * at.freq_hz.max() / LIGHT)
-    return kernels.cells(ready.sky.grid, w if problem.uv_range is None else min(w, BACK * problem.uv_range[1]), w)
+    if problem.uv_range is None:
+        return kernels.cells(ready.sky.grid, w, w)
+    widest = BACK * problem.uv_range[1]
+    some = at.block(slice(None, None, -(-problem.shape[0] // LOOKED)), slice(-1, None))
+    uvw = some.uvw_m[:, problem.antenna1] - some.uvw_m[:, problem.antenna2]
+    there = np.hypot(uvw[..., 0], uvw[..., 1]) * at.freq_hz.max() / LIGHT <= widest
+    deep = BACK * float(np.abs(uvw[..., 2][there]).max(initial=0.0) * at.freq_hz.max() / LIGHT)
+    return kernels.cells(ready.sky.grid, min(w, widest), min(w, deep))

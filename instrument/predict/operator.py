@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from dataclasses import replace
+from typing import Self
 
 from instrument.errors import InputError
 from instrument.observe.grid import ImageGrid
@@ -43,6 +45,12 @@ class ImageOperator(Prepared):
                 f"the operator is of {own[0]:g} to {own[1]:g} wavelengths, and the imager takes {asked}: give it that "
                 "range, or prepare the operator by a plan with the range of the imager"
             )
+
+    def within(self, uv_range: tuple[float, float] | None) -> Self:
+        """The operator of these visibilities alone, and 0 for others; itself where it has a range already."""
+        if uv_range is None or self.problem.uv_range is not None:
+            return self
+        return replace(self, problem=replace(self.problem, uv_range=uv_range))
 
     @abstractmethod
     def forward(self, images: Float, times: slice, channels: slice, pairs: tuple[Int, Int] | None = None) -> Complex:

@@ -214,6 +214,24 @@ def test_an_operator_of_fewer_visibilities_than_the_imager_takes_is_refused():
         BeamImager(pixels=24, pixel=PIXEL, uv_range=UV, way="joint", mask=~mask & mask).image(vis, operator)
 
 
+def test_an_operator_of_all_baselines_does_no_more_than_the_imager_takes():
+    """The images of an operator prepared for the range, to both tolerances; it works on fewer samples."""
+    sky, _ = sources()
+    whole = plan_of(sky)
+    free = Scene(instrument=whole.instrument, sky=sky, observation=whole.observation).plan(tolerance=0.0)
+    grid = ImageGrid(pixels=24, pixel=PIXEL)
+    every, some = free.operator(grid, 1e-5), whole.operator(grid, 1e-5)
+    assert every.within(None) is every
+    assert some.within(UV) is some
+    assert every.within(UV).problem.uv_range == UV
+    assert every.within(UV).work().flops < every.work().flops
+    one, other = (
+        BeamImager(pixels=24, pixel=PIXEL, uv_range=UV).image(plan.run(), operator).data
+        for plan, operator in ((free, every), (whole, some))
+    )
+    assert np.abs(one - other).max() <= 2e-5 * np.abs(other).max()
+
+
 def test_a_channel_without_visibilities_is_nan_and_the_others_are_not_lost():
     night = Observation(
         phase_centre="08h13m36.0s +48d13m03s", transit="2012-12-07", duration=4 * u.hour, interval=2 * u.hour,
