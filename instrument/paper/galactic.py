@@ -31,6 +31,7 @@ QUICK = (
     "tolerance=1e-3",
 )  # fmt: skip
 SPECTRA = ("analyze.cube={products=['spectrum-2d']}",)  # all else is made here, of the cube with noise and without
+MK2 = 1e6  # of a K²
 HALF_POWER_DEG = 1.9
 INNER_DEG = 3.0
 LOW, K_PERP = 0.06, (0.05, 0.5)  # 1/Mpc
@@ -100,7 +101,7 @@ def _depths(bench: Bench, kelvin: StokesCube) -> list[Finding]:
             "0",
             (-fwhm / 2, fwhm / 2),
             f"I is real, so that its depths are those of P and their negatives; the RMSF is {fwhm:.2f} rad/m² wide, "
-            f"and at 0 there is {at_zero:.0f} % of the power at the brightest: the two run together",
+            f"and at 0 there is {at_zero:.0f} % of the power at the brightest",
         ),
         Finding("Faraday depth of P, brightest", tops["P"][0], "rad/m²", "1.2", (1.2 - fwhm / 2, 1.2 + fwhm / 2)),
         Finding(
@@ -178,7 +179,7 @@ def _root(leak: Cylindrical, whole: Cylindrical, k_par: tuple[float, float]) -> 
 
 def _excess(leak: Spherical, delta2: Float, signal: Signal21cm) -> float:
     """The k up to which leakage stays below the signal, from its first bin below on."""
-    below = np.asarray(delta2) < signal.delta2(np.asarray(leak.k))
+    below = MK2 * np.asarray(delta2) < signal.delta2(np.asarray(leak.k))
     if not below.any():
         return float("nan")
     first = int(np.argmax(below))
