@@ -21,6 +21,7 @@ EXPERIMENTS = {
     "aw-correction": ("aw_correction", "Leakage taken out by beam-corrected imaging", "A-projection"),
     "galactic": ("galactic", "The polarized Galaxy leaked into I, and the window on the signal", "Galactic emission"),
     "gmca": ("gmca", "Leaked polarization removed, and the signal that goes with it", "foreground removal"),
+    "whole-way": ("whole_way", "Beyond: a signal through gains, an incomplete model, leakage, removal", "outlook"),
     "ixr": ("ixr", "Leakage in dB, what must be removed, and the IXR of telescopes over their fields", "discussion"),
     "errata": ("errata", "Slips of the paper: the printed form beside the right one", "formulae and tables"),
 }

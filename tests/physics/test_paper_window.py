@@ -1,0 +1,53 @@
+"""Experiments of the paper that end in images, spectra and the window: quick forms, whole."""
+
+import pytest
+
+from instrument.paper.bench import Bench
+from instrument.paper.experiments import experiment
+from instrument.paper.finding import NOT
+
+pytestmark = pytest.mark.long
+
+
+def found(name, folder):
+    """Numbers of the quick form by name; none of the paper's is missed without a reason."""
+    findings = experiment(name)(Bench(folder, quick=True))
+    assert not [f.what for f in findings if f.agreement == NOT]
+    return {f.what: f.ours for f in findings}
+
+
+def test_leakage_of_the_galaxy_into_v_is_far_below_that_into_i(tmp_path):
+    """V of the element beam is two orders below the linear leakage, in another beam program too; more noise, less window."""
+    ours = found("galactic", tmp_path)
+    assert ours["window open up to k_par, without noise in Q and U"] >= ours["window open up to k_par"]
+    assert ours["the same, 70 % of the leakage removed"] >= ours["window open up to k_par"]
+    assert ours["sqrt(V/P) below k_par 0.06 /Mpc"] < 0.02 * ours["sqrt(I/P) below k_par 0.06 /Mpc"]
+
+
+def test_removal_takes_leakage_and_leaves_what_is_rough(tmp_path):
+    ours = found("gmca", tmp_path)
+    assert ours["polynomial: signal kept above k_par 0.1 /Mpc"] == pytest.approx(100, abs=0.5)  # smooth by definition
+    assert ours["stokes-templates: the same, 60 mK"] < 0.1 < ours["gmca: the same, 60 mK"]  # Q and U tell what leaks
+
+
+def test_correction_takes_leakage_out_and_a_wrong_beam_leaves_a_share(tmp_path):
+    """A wrong beam leaves about its rms, over the root of the stations where each is wrong on its own."""
+    ours = found("aw-correction", tmp_path)
+    alike, each = (
+        ours[f"the same, beam of {who} wrong{how} by 10 %"]
+        for who, how in (("all stations", " alike"), ("each station", ""))
+    )
+    assert ours["leakage left at the worst source, joint solution"] < 1e-4
+    assert 1 < alike / each < 8
+    assert (
+        ours["diffuse: the same after correction (Q and U solved, their leakage predicted)"]
+        < 0.1 * ours["I over P of a diffuse sky, inside half power"]
+    )
+
+
+def test_a_signal_comes_back_whole_where_gains_are_known(tmp_path):
+    """Leakage does not reach k_par of 0.1 /Mpc: the power recovered is that injected. Wrong gains bring more."""
+    ours = {key.rpartition(": ")[2]: value for key, value in found("whole-way", tmp_path).items()}
+    assert ours["gains known"] == pytest.approx(1, abs=0.02)
+    assert ours["gains known; polynomial"] == pytest.approx(1, abs=0.02)
+    assert ours["gains known"] < ours["all sources in the model"] < ours["5 sources in the model"]
