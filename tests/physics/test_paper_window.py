@@ -17,7 +17,7 @@ def found(name, folder):
 
 
 def test_leakage_of_the_galaxy_into_v_is_far_below_that_into_i(tmp_path):
-    """V of the element beam is two orders below the linear leakage, in another beam program too; more noise, less window."""
+    """V of the element beam is two orders below the linear leakage, also elsewhere; more noise, less window."""
     ours = found("galactic", tmp_path)
     assert ours["window open up to k_par, without noise in Q and U"] >= ours["window open up to k_par"]
     assert ours["the same, 70 % of the leakage removed"] >= ours["window open up to k_par"]
