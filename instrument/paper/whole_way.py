@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
-from instrument.analyze.analyzer import Analyzer
+from instrument.analyze.power.cylinders import Cylindrical
 from instrument.analyze.power.recovered import Recovered, recovered_power
 from instrument.analyze.power.transform import Transform
 from instrument.calibrate.selfcal import SelfCal
@@ -18,9 +19,11 @@ from instrument.paper.bench import Bench
 from instrument.paper.finding import Finding
 from instrument.pipeline.scene_file import parse
 from instrument.registry import load
-from instrument.report.recovered import recovered_over_injected
+from instrument.report.spectra import LOOKS
+from instrument.report.style import GREY, axes_of, styled
 from instrument.scene import Scene
 from instrument.sky.base import Sky
+from instrument.units import Float
 from instrument.visibilities import Visibilities
 
 COMMON = ("analyze.cube={products=['spectrum-2d']}", "tolerance=1e-3", "sky.pixel=3 arcmin", "image.uv_range=[30, 500]")
@@ -42,7 +45,6 @@ REMOVERS: dict[str, dict[str, Any]] = {"polynomial": {}, "stokes-templates": {"o
 
 def run(bench: Bench) -> list[Finding]:
     """Power of the signal recovered over that injected above k_par of 0.1 /Mpc, by ways to calibrate and to remove."""
-    from astropy import units as u
 
     core = [name for name in load("telescopes", "lofar-hba").layout().names if name.endswith("HBA0")]
     stations = f"instrument.stations={core[: bench.choose(16, None)]}"
@@ -71,20 +73,17 @@ def run(bench: Bench) -> list[Finding]:
     lost = [100 * float(1 - one.converged.mean()) for one in solutions.values()]
     ends: dict[str, Recovered] = {}
     how = Transform("I", "blackman-harris", "hann", (30.0, 500.0))
-    k_max = float(Analyzer(injected).cells("I").k_par.max())
     found = []
     for name, vis in ways.items():
         cube = image(vis - model)
         for remover in ("", *(REMOVERS if name in ("gains known", "5 sources in the model") else ())):
             left = load("foregrounds", remover, **REMOVERS[remover]).split(cube).residual if remover else cube
             key = f"{name}; {remover}" if remover else name
-            edges = np.linspace(HIGH, k_max, 6) / u.Mpc
-            above = recovered_power(left, injected, None, how, 6, edges, shape="cylindrical")
-            found.append(Finding(f"power recovered over injected, k_par above 0.1 /Mpc: {key}", _whole(above)))
-            if remover in ("", "stokes-templates"):
-                ends[key] = recovered_power(left, injected, how=how, bins=10)
+            ends[key] = recovered_power(left, injected, how=how, bins=6, shape="cylindrical")
+            above = float(_ratio(ends[key], _k_par(ends[key]) > HIGH))
+            found.append(Finding(f"power recovered over injected, k_par above 0.1 /Mpc: {key}", above))
     found += [Finding(f"solves that failed: {name}", share, "%") for name, share in zip(solutions, lost, strict=True)]
-    bench.draw("recovered", recovered_over_injected(ends), "Power of I at the end over that of the signal alone.")
+    bench.draw("recovered", _drawn(ends), "Power of I at the end over that of the signal alone.", wide=True)
     return found
 
 
@@ -127,7 +126,29 @@ def _wide(solver: SelfCal, data: Visibilities) -> SelfCal:
     return solver.with_fields(channels=max(1, min(len(data.freq_hz), round(8e6 / width))))
 
 
-def _whole(end: Recovered) -> float:
-    """Power recovered over injected, of all cells together."""
-    ours, due = (np.nansum(one.power * one.count) for one in (end.recovered, end.injected))
-    return float(ours / due)
+def _ratio(end: Recovered, rows: Any) -> Any:
+    """Power recovered over injected of all k_perp together, in some rows of k_par."""
+    ours, due = (np.nansum((one.power * one.count)[:, rows], axis=0) for one in (end.recovered, end.injected))
+    return ours / due if np.ndim(rows) == 0 else ours.sum() / due.sum()
+
+
+def _k_par(end: Recovered) -> Float:
+    assert isinstance(end.injected, Cylindrical)
+    return end.injected.k_par
+
+
+@styled
+def _drawn(ends: dict[str, Recovered]) -> Axes:
+    ax = axes_of(None, (9.5, 5.0))
+    ways = list(dict.fromkeys(name.partition("; ")[0] for name in ends))
+    for name, end in ends.items():
+        way, _, remover = name.partition("; ")
+        colour, marker = LOOKS[ways.index(way) % len(LOOKS)]
+        ratio = [_ratio(end, k) for k in range(len(_k_par(end)))]
+        look: dict[str, Any] = {"ls": ("-", "--", ":", "-.")[["", *REMOVERS].index(remover)], "marker": marker}
+        ax.plot(_k_par(end), ratio, color=colour, ms=3, lw=1.2, label=name, **look)
+    ax.axhline(1, color=GREY, lw=0.8)
+    ax.axvline(HIGH, color=GREY, lw=0.8, ls=":")
+    ax.set(yscale="log", xlabel=r"$k_\parallel$ (1/Mpc)", ylabel="power over that injected")
+    ax.legend(frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
+    return ax
