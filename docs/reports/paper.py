@@ -27,7 +27,7 @@ FIXED = ("beam", "ixr", "errata")  # nothing in them, or next to nothing, is dra
 SHOWN = {  # figures of docs/paper.md
     "beam": ("mueller", "leakage"), "di-errors": ("spectra",), "mock-grid": ("profile",), "3c196": ("spectra",),
     "incomplete-model": ("errors",), "aw-correction": ("sources",), "galactic": ("faraday_I", "ratio", "window"),
-    "gmca": ("gmca",), "ixr": ("removal",), "errata": ("slips",),
+    "gmca": ("gmca",), "whole-way": ("recovered",), "ixr": ("removal",), "errata": ("slips",),
 }  # fmt: skip
 
 
