@@ -2,10 +2,11 @@
 
     instrument paper --out FULL                            the full form, once; --out AGAIN, a second time
     python docs/reports/paper.py --seeds 20 --work QUICK   the quick form with seeds 1 to 20: paper/seeds.ecsv
-    python docs/reports/paper.py --full FULL [--again AGAIN]   tables and figures
+    python docs/reports/paper.py --full FULL [MORE ...] [--again AGAIN]   tables and figures
 
-Runs that QUICK holds already are not run again. The tables are put between the two marks in docs/paper.md, the figures
-into docs/reports/paper; AGAIN is compared number by number, and what differs is told in paper/again.md.
+Runs that QUICK holds already are not run again; of an experiment that several full runs have, the last is taken. The
+tables are put between the two marks in docs/paper.md, the figures into docs/reports/paper; AGAIN is compared number by
+number, and what differs is told in paper/again.md.
 """
 
 import argparse
@@ -35,16 +36,21 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=0)
     parser.add_argument("--work", type=Path, default=Path("runs/paper-seeds"))
-    parser.add_argument("--full", type=Path)
+    parser.add_argument("--full", type=Path, nargs="+", default=[])
     parser.add_argument("--again", type=Path)
     given = parser.parse_args()
     if given.seeds:
         spread(given.work, given.seeds)
-    if given.full:
-        tables(given.full)
-        figures(given.full)
+    runs = {name: (folder, run) for folder in given.full for run in [record(folder)] for name in run["numbers"]}
+    if runs:
+        tables(runs)
+        figures(runs)
     if given.again:
-        again(given.full, given.again)
+        again(given.full[0], given.again)
+
+
+def record(folder):
+    return json.loads((folder / "run.json").read_text())
 
 
 def spread(work, count):
@@ -94,40 +100,36 @@ def deviations():
     }
 
 
-def tables(full):
-    """Put the tables of a full run into docs/paper.md."""
-    run, known = json.loads((full / "run.json").read_text()), deviations()
-    versions = ", ".join(
-        f"{name} {text}" for name, text in run["versions"].items() if name in ("instrument", "numpy", "ducc0")
-    )
-    total, peak = sum(run["seconds"].values()) / 60, max(run["memory"].values()) / 1e9
+def tables(runs):
+    """Put the tables of full runs, by experiment, into docs/paper.md."""
+    known = deviations()
+    last = max((run for _, run in runs.values()), key=lambda run: run["finished"])
+    versions = ", ".join(f"{name} {last['versions'][name]}" for name in ("instrument", "numpy", "ducc0"))
+    total = sum(run["seconds"][name] for name, (_, run) in runs.items()) / 60
+    peak = max(max(run["memory"].values()) for _, run in runs.values()) / 1e9
     seeds = max((count for _, count in known.values()), default=0)
+    said = (
+        f" After ± the standard deviation over {seeds} seeds of the quick form (`--quick --seed N`)." if seeds else ""
+    )
     parts = [
         MARKS[0],
-        f"`instrument paper`, {run['finished'][:10]}, {versions}: {total:.0f} minutes on two cores, {peak:.1f} GB. "
-        f"After ± the standard deviation of the number over {seeds} seeds of the quick form (`--quick --seed N`).",
+        f"`instrument paper`, {last['finished'][:10]}, {versions}: {total:.0f} minutes, {peak:.1f} GB.{said}",
     ]
-    for name, numbers in run["numbers"].items():
-        title = EXPERIMENTS[name][1]
+    for name in (name for name in EXPERIMENTS if name in runs):
+        folder, run = runs[name]
         said = run["verdicts"][name]
-        parts.append(f"### `{name}`: {title}\n\n**{said[0].upper()}{said[1:]}.** {run['seconds'][name]:.0f} s.\n")
+        seconds = f"{run['seconds'][name]:.0f} s"
+        parts.append(f"### `{name}`: {EXPERIMENTS[name][1]}\n\n**{said[0].upper()}{said[1:]}.** {seconds}.")
         lines = ["| | ours | the paper | |", "|---|---|---|---|"]
-        for row in Table.read(full / f"{name}.ecsv"):
-            std = known.get((name, str(row["what"])), (0.0, 0))[0]
-            error = f" ± {number(std, 2)}" if std > 0 else ""
-            text = [
-                str(row[key])
-                for key in ("agreement", "because", "since")
-                if row[key] is not np.ma.masked and str(row[key])
-            ]
-            unit = "" if row["unit"] is np.ma.masked else str(row["unit"])
-            paper_said = "" if row["paper"] is np.ma.masked else str(row["paper"])
-            lines.append(
-                f"| {row['what']} | {number(float(row['ours']))}{error} {unit} | {paper_said} | {'; '.join(text)} |"
-            )
-        assert len(numbers) == len(lines) - 2
+        for row in Table.read(folder / f"{name}.ecsv"):
+            text = {key: "" if row[key] is np.ma.masked else str(row[key]) for key in row.colnames}
+            std = known.get((name, text["what"]), (0.0, 0))[0]
+            ours = number(float(row["ours"])) + (f" ± {number(std, 2)}" if std > 0 else "")
+            why = "; ".join(text[key] for key in ("agreement", "because", "since") if text[key])
+            lines.append(f"| {text['what']} | {ours} {text['unit']} | {text['paper']} | {why} |")
+        assert len(run["numbers"][name]) == len(lines) - 2
         parts.append("\n".join(lines))
-        parts.append("\n".join(f"![{name}: {figure}](reports/paper/{name}_{figure}.png)" for figure in SHOWN[name]))
+        parts += [f"![{name}: {figure}](reports/paper/{name}_{figure}.png)" for figure in SHOWN[name]]
     parts.append(MARKS[1])
     page = PAGE.read_text()
     new = "\n\n".join(parts)
@@ -136,25 +138,25 @@ def tables(full):
     PAGE.write_text(page[: found.start()] + new + page[found.end() :])
 
 
-def figures(full):
+def figures(runs):
     """The figures of the page, not wider than 1100 points."""
     from PIL import Image
 
-    for name, names in SHOWN.items():
-        for figure in names:
-            image = Image.open(full / name / f"{figure}.png").convert("RGB")
+    for name, (folder, _) in runs.items():
+        for figure in SHOWN[name]:
+            image = Image.open(folder / name / f"{figure}.png").convert("RGB")
             image.thumbnail((1100, 1100))
             image.quantize(128).save(HERE / f"{name}_{figure}.png", optimize=True)
 
 
 def again(full, other):
     """Numbers of two runs of the full form that are not the same."""
-    one, two = (json.loads((folder / "run.json").read_text()) for folder in (full, other))
+    one, two = record(full), record(other)
     rows = []
     for name, numbers in one["numbers"].items():
         for what, value in numbers.items():
             beside = two["numbers"][name][what]
-            if beside != value:
+            if beside != value:  # None, which is NaN, is itself
                 share = abs(beside - value) / max(abs(value), 1e-300)
                 rows.append(f"| {name} | {what} | {number(value, 6)} | {number(beside, 6)} | {share:.1e} |")
     every = sum(len(numbers) for numbers in one["numbers"].values())

@@ -31,8 +31,7 @@ def page(outcomes: Sequence[Any], what: Mapping[str, Any]) -> Page:
         if one.figures:
             blocks.append(Figures(one.figures))
         blocks.append(Text(f"{one.verdict[0].upper()}{one.verdict[1:]}."))
-        title, where = EXPERIMENTS[one.name][1:]
-        sections.append(Section(f"{one.name}: {title} ({where})", blocks))
+        sections.append(Section(f"{one.name}: {EXPERIMENTS[one.name][1]}", blocks))
     known = ", ".join(f"{name} {text}" for name, text in what["versions"].items())
     last = [Text(what["command"], code=True)] if what["command"] else []
     return Page(
