@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
-from instrument.errors import unused_ledger
+from instrument.errors import InputError, unused_ledger
 from instrument.memory import high_water
 from instrument.paper.bench import Bench
 from instrument.paper.experiments import EXPERIMENTS, chosen, experiment
@@ -46,9 +46,12 @@ def paper(
 ) -> bool:
     """Run experiments (default: all) and write their folder; whether every number of the paper was reproduced.
 
-    A number that differs for a reason, which a run that changes just that has shown, counts as reproduced.
+    A number that differs for a reason counts as reproduced. Raises `InputError` for a name that is none, or a seed
+    below 1.
     """
     every = chosen(names)
+    if seed is not None and seed < 1:
+        raise InputError(f"--seed {seed}: give a whole number of 1 or more, or leave it out for those of the scenes")
     outcomes: list[Outcome] = []
     with RunFolder("-".join(["paper", *names]), out, force) as folder, progress_bar("paper") as bar, unused_ledger():
         for k, name in enumerate(every):

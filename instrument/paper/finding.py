@@ -14,8 +14,8 @@ Range = tuple[float, float]
 class Finding(NamedTuple):
     """One number. `within` is where it is to lie to be the paper's; `because` the reason where it does not.
 
-    A reason is a run that changes just one thing, with the number that came out of it. Without `within` the number is
-    one that the paper does not have.
+    A reason has a number that was measured where one thing is changed; that it accounts for all of the difference is
+    for the reader to judge. Without `within` the number is one that the paper does not have.
     """
 
     what: str

@@ -20,7 +20,7 @@ def page(outcomes: Sequence[Any], what: Mapping[str, Any]) -> Page:
     cards = [
         Card("the paper's numbers", str(len(said) - said.count(MORE)), f"{said.count(MORE)} more beside them"),
         Card("reproduced", str(said.count(AGREES)), "", "good"),
-        Card("differ for a reason", str(said.count(DIFFERS)), "each shown by a run that changes just that"),
+        Card("differ for a reason", str(said.count(DIFFERS)), "with a number that shows it: read it"),
         Card("not reproduced", str(bad), "", "bad" if bad else "good"),
         Card("time", duration(sum(one.seconds for one in outcomes)), f"{what['form']} form"),
     ]

@@ -105,6 +105,12 @@ def test_an_unknown_experiment_is_one_line_and_leaves_nothing(tmp_path, capsys, 
     assert not list(tmp_path.iterdir())
 
 
+def test_a_seed_that_would_be_none_is_refused(tmp_path, capsys):
+    assert main(["paper", "ixr", "--seed", "0", "--out", str(tmp_path / "p")]) == 2
+    assert capsys.readouterr().err.count("--seed 0: give a whole number of 1 or more") == 1
+    assert not list(tmp_path.iterdir())
+
+
 def test_its_help_lists_the_experiments(capsys):
     assert main(["paper", "--help"]) == 0
     text = "".join(capsys.readouterr().out.split())  # lines break at hyphens too
