@@ -14,6 +14,7 @@ from instrument.calibrate.cluster_common import Common
 from instrument.calibrate.cluster_data import Block
 from instrument.calibrate.cluster_equations import Equations, conjugate_gradients, dot
 from instrument.calibrate.gauge import BLIND, common_form, second_moment
+from instrument.patience import Patience
 from instrument.units import Complex, Float
 
 HELD = 4  # first rounds, in which each station is solved with the others held, and goes half the way
@@ -55,8 +56,9 @@ class Rounds:
         self.free = free_directions(self.block)
 
     def run(self) -> None:
-        """Rounds until nothing moves, or there have been enough."""
-        while not self.still and len(self.history) < self.block.limits.iterations:
+        """Rounds until nothing moves, there have been enough, or many have led no nearer."""
+        patience, lost = Patience(), False
+        while not (self.still or lost) and len(self.history) < self.block.limits.iterations:
             weight = self.block.weights(self.left)
             equations = Equations(self.block, self.x, self.z, weight)
             gradient = equations.sums(self.left)
@@ -64,6 +66,7 @@ class Rounds:
                 self._go(self.block.onto(self.x + equations.held(gradient) / 2))
             else:
                 self._together(equations, gradient)
+            lost = bool(patience.lost(self.history[-1])[0])
 
     def _together(self, equations: Equations, gradient: Complex) -> None:
         """A round for all stations at once."""

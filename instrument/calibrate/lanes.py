@@ -14,6 +14,7 @@ from instrument.calibrate.fit import Left
 from instrument.calibrate.gauge import GENERATORS, HELD_TO, Gauge
 from instrument.calibrate.newton import EXACT, solved_together
 from instrument.calibrate.normal import BASIS
+from instrument.patience import Patience
 from instrument.units import Complex, Float, Int
 
 FAR = 0.3  # relative step above which sweeps are averaged instead of corrected
@@ -77,7 +78,7 @@ class Lanes:
         best, best_new, best_left, best_cost = jones, jones, jones, np.full(self.count, np.inf)
         near = np.zeros(self.count, bool)
         coupling, of = None, damping
-        memory = Memory(self.count)
+        memory, patience = Memory(self.count), Patience(self.count)
         history = []
         for turn in range(self.settings.iterations):
             sweep(self.v, self.m, self.a1, self.a2, planar(jones, self.lanes), right, left)
@@ -106,7 +107,7 @@ class Lanes:
             count[running] += 1
             step = np.where(running, last, step)
             history.append(float(np.nanmax(step, initial=0.0)))
-            if not np.any(step > self.settings.tolerance):
+            if not np.any((step > self.settings.tolerance) & ~patience.lost(step)):
                 break
         return jones, step, count, np.array(history)
 

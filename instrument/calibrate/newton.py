@@ -13,6 +13,7 @@ from instrument.calibrate.common import CommonPart
 from instrument.calibrate.factor import Factor
 from instrument.calibrate.normal import BASIS, normal_matrix
 from instrument.calibrate.steps import downhill, lengths, turned
+from instrument.patience import Patience
 from instrument.units import Bool, Complex, Float, Int
 
 NEAR = 0.1  # relative step of averaged sweeps below which all stations are solved at once
@@ -68,6 +69,7 @@ def solved_together(lanes: Side, jones: Complex) -> tuple[Complex, Float, Int, F
     sums = _Sums(lanes)
     solves = [_Lane(lanes, k) for k in range(lanes.count)]
     step, count, history = np.full(lanes.count, np.inf), np.zeros(lanes.count, int), []
+    patience = Patience(lanes.count)
     for _ in range(lanes.settings.iterations):
         share, left_over, new = sums.at(jones)
         for k, solve in enumerate(solves):
@@ -77,7 +79,7 @@ def solved_together(lanes: Side, jones: Complex) -> tuple[Complex, Float, Int, F
                 count[k] += 1
                 jones[k], step[k] = solve.next(jones[k], share[k], left_over[k], new[k])
         history.append(float(np.nanmax(step, initial=0.0)))
-        if not np.any(step > lanes.settings.tolerance):
+        if not np.any((step > lanes.settings.tolerance) & ~patience.lost(step)):
             break
     lanes.factors = {k: one.factor for k, one in enumerate(solves) if one.factor is not None}
     return jones, step, count, np.array(history)

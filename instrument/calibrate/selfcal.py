@@ -29,12 +29,12 @@ class SelfCal(Calibrator):
 
     `pattern` "full", "diagonal", "scalar" (one complex gain) or "phase" (a phase per receptor). `channels` of one
     solution (1 by default). Stops when no station's matrix changes by more than `tolerance` of itself; the corrected
-    data then differ from the model by about that much. `min_baseline` leaves out shorter ones. `start` is a term to
-    start from (a solution of before, say), the identity otherwise; where that leads nowhere, the leading eigenvectors
-    of V M^H are tried, and the better fit is kept. A fit that leaves more than `unexplained` of the rms of the data is
-    reported as `Outcome.POOR_FIT`. Without `errors` those of gains are not worked out, which with beams in the model
-    may take as long as the solve (those of common directions are). Intervals are solved many at a time in compiled
-    code; float64 throughout.
+    data then differ from the model by about that much. Or after `iterations`, or where 100 more lead hardly nearer.
+    `min_baseline` leaves out shorter ones. `start` is a term to start from (a solution of before, say), the identity
+    otherwise; where that leads nowhere, the leading eigenvectors of V M^H are tried, and the better fit is kept. A fit
+    that leaves more than `unexplained` of the rms of the data is reported as `Outcome.POOR_FIT`. Without `errors` those
+    of gains are not worked out, which with beams in the model may take as long as the solve (those of common directions
+    are). Intervals are solved many at a time in compiled code; float64 throughout.
     """
 
     pattern: Literal["full", "diagonal", "scalar", "phase"] = "full"

@@ -7,15 +7,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-AGREES, DIFFERS, NOT, MORE = "agrees", "differs, for a reason", "NOT REPRODUCED", ""
+AGREES, DIFFERS, CORRECTED, NOT, MORE = "agrees", "differs, for a reason", "a slip, corrected", "NOT REPRODUCED", ""
 Range = tuple[float, float]
 
 
 class Finding(NamedTuple):
     """One number. `within` is where it is to lie to be the paper's; `because` the reason where it does not.
 
-    A reason has a number that was measured where one thing is changed; that it accounts for all of the difference is
-    for the reader to judge. Without `within` the number is one that the paper does not have.
+    A reason counts where `changed`, the number with the one thing changed that `because` names, lies there. Without
+    `within` the number is one that the paper does not have. Of a `slip` `within` is where the right number must lie, by
+    other means than ours, and `changed` what the printed form gives: it is one where that lies outside.
     """
 
     what: str
@@ -25,25 +26,31 @@ class Finding(NamedTuple):
     within: Range | None = None
     because: str = ""
     since: str = ""  # what others have published, to stand beside it
+    changed: float = float("nan")
+    slip: bool = False
 
     @property
     def agreement(self) -> str:
         """Whether the paper's number is reproduced."""
         if self.within is None:
             return MORE
-        low, high = self.within
-        if np.isfinite(self.ours) and low <= self.ours <= high:
+        ours, changed = (bool(self.within[0] <= x <= self.within[1]) for x in (self.ours, self.changed))
+        if self.slip:
+            return CORRECTED if ours and np.isfinite(self.changed) and not changed else NOT
+        if ours:
             return AGREES
-        return DIFFERS if self.because else NOT
+        return DIFFERS if self.because and changed else NOT
 
 
 def verdict(findings: Sequence[Finding]) -> str:
     """The last line of an experiment: reproduced, reproduced with a reason for the difference, or not."""
     said = [finding.agreement for finding in findings if finding.agreement != MORE]
-    if NOT in said:
-        missed = "; ".join(finding.what for finding in findings if finding.agreement == NOT)
-        return f"not reproduced: {missed}"
-    count = said.count(DIFFERS)
+    missed = [finding.what for finding in findings if finding.agreement == NOT]
+    if missed:
+        return f"{len(missed)} of {len(said)} not reproduced: {'; '.join(missed)}"
     if not said:
         return "beyond the paper: it has no number to hold ours against"
+    if CORRECTED in said:
+        return f"{said.count(CORRECTED)} slips shown: what is printed is not what is right"
+    count = said.count(DIFFERS)
     return f"reproduced, {count} of {len(said)} with a reason for the difference" if count else "reproduced"

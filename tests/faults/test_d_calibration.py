@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from astropy import units as u
 
-from instrument import GainTerm, InputError, Outcome, SelfCal
+from instrument import DirectionalCal, GainTerm, InputError, Outcome, SelfCal
 
 spec = importlib.util.spec_from_file_location("hard", Path(__file__).with_name("hard_calibrations.py"))
 hard = importlib.util.module_from_spec(spec)
@@ -246,3 +246,13 @@ def test_c2_a_length_that_is_not_asked_is_said():
     assert solution.interval_s == 20
     assert "intervals last 20 s, not 25 s" in str(solution)
     assert not SelfCal(interval=1 * u.day).solve(truth, truth).notes
+
+
+@pytest.mark.parametrize("solver", [SelfCal, DirectionalCal])
+def test_solves_of_what_has_no_answer_end_below_any_limit(solver):
+    """Noise, an unpolarized model and three stations; a limit of 2^31 iterations would be hours."""
+    model, rng = of(3, polarized=0.0)
+    data = model.with_data(rng.standard_normal(model.data.shape) + 1j * rng.standard_normal(model.data.shape))
+    solution = solver(iterations=2**31).solve(data, model)
+    assert solver is DirectionalCal or not solution.converged.all()  # its prior holds what nothing tells
+    assert solution.iterations.max() < 5000

@@ -29,7 +29,7 @@ LAYERS = (
     ("units", "checked"),
     ("files_in", "memory", "machine"),
     ("h5",),
-    ("registry", "mat2", "phasor"),
+    ("registry", "mat2", "phasor", "patience"),
     ("component",),
     ("plugin_settings",),
     ("observe",),

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from instrument.errors import Outcome
+from instrument.patience import Patience
 from instrument.units import Float, Int
 
 NEAR = 3e-9  # reciprocal condition of the PSF matrix below which sources are not told apart
@@ -54,10 +55,12 @@ def conjugate_gradients(
     """normal(f) = right (G, 4) for the four Stokes parameters at once, each with its own step, from a first `flux`."""
     residual = right - normal(flux)
     direction, power = residual.copy(), (residual**2).sum(axis=0)
-    target = accuracy**2 * (right**2).sum(axis=0).max()
+    target, patience = accuracy**2 * (right**2).sum(axis=0).max(), Patience()
     for count in range(1, iterations + 1):
         if np.all(power <= target):
             return flux, Outcome.CONVERGED, count
+        if patience.lost(power.max())[0]:
+            return flux, Outcome.ITERATION_LIMIT, count
         image = normal(direction)
         curve = (direction * image).sum(axis=0)
         step = np.divide(power, curve, out=np.zeros(4), where=curve > 0)
