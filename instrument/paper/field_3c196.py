@@ -53,7 +53,7 @@ def run(bench: Bench) -> list[Finding]:
             Finding(
                 f"{stokes} over I in the 2D spectrum, rms", value, "%", "0.05 to 0.06", both,
                 f"{rims[stokes]:.3f} % without the taper, which weighs the rim of the field down"
-                if not both[0] <= value <= both[1] else "",
+                if not both[0] <= value <= both[1] else "", changed=rims[stokes],
             )
             for stokes, value in (("Q", q), ("U", u))
         ],

@@ -51,6 +51,6 @@ def verdict(findings: Sequence[Finding]) -> str:
     if not said:
         return "beyond the paper: it has no number to hold ours against"
     if CORRECTED in said:
-        return f"{said.count(CORRECTED)} slips shown: what is printed is not what is right"
+        return f"what is printed is not what is right, in {said.count(CORRECTED)} of {len(said)} numbers"
     count = said.count(DIFFERS)
     return f"reproduced, {count} of {len(said)} with a reason for the difference" if count else "reproduced"

@@ -114,6 +114,7 @@ def _depths(bench: Bench, kelvin: StokesCube) -> list[Finding]:
             (10.0, 15.0),
             f"within {INNER_DEG / 2} deg it is {nearer:.1f}: leakage grows with the distance, and the mock sky has its "
             "bright places where the seed puts them",
+            changed=nearer,
         ),
     ]
 
@@ -150,8 +151,8 @@ def _windows(found: Seen, quiet: Seen, signal: Signal21cm) -> list[Finding]:
             "/Mpc",
             "0.3",
             (0.2, 0.4),
-            f"noise in Q and U {louder:.1f} times that of the night of Table 2 makes it 0.3: the paper's Q and U are "
-            "images of real data",
+            f"noise in Q and U of {louder:.1f} times that of the night of Table 2 would make it 0.3; that the paper's "
+            "Q and U, images of real data, have so much is not known",
         ),
         Finding("the same without noise in Q and U", over[1], "/Mpc"),
         Finding("window open up to k_par, without noise in Q and U", quiet.window.reach()[1], "/Mpc"),

@@ -61,7 +61,15 @@ def _of_paper() -> list[Finding]:
     found = [
         Finding("IXR_M of a station that leaks 0.3 %", m, "dB", "25", (24.5, 25.5)),
         Finding("IXR_J of the same", j, "dB", "56", (55.5, 56.5)),
-        Finding("IXR_M of 25 dB with 70 % of the leakage removed", m_left, "dB", "35", (34.5, 35.5), printed),
+        Finding(
+            "IXR_M of 25 dB with 70 % of the leakage removed",
+            m_left,
+            "dB",
+            "35",
+            (34.5, 35.5),
+            printed,
+            changed=25 + step,
+        ),
     ]
     target, wrong = LEAKAGE * LEFT, float(leakage_of_ixr(35.0))
     for db in (25.0, 20.0, 15.0):

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from instrument.paper.experiments import EXPERIMENTS
-from instrument.paper.finding import AGREES, DIFFERS, MORE, NOT, Finding
+from instrument.paper.finding import AGREES, CORRECTED, DIFFERS, MORE, NOT, Finding
 from instrument.report.page import Block, Card, Cell, Figures, Page, Section, Table, Text, duration, number
 
 HEADS = ("", "ours", "the paper", "agreement", "why, and what others found")
@@ -16,11 +16,12 @@ MARKS: dict[str, Any] = {AGREES: "good", NOT: "bad"}
 def page(outcomes: Sequence[Any], what: Mapping[str, Any]) -> Page:
     """Of the outcomes of experiments and their record."""
     said = [f.agreement for one in outcomes for f in one.findings]
-    bad = said.count(NOT)
+    bad, total = said.count(NOT), len(said) - said.count(MORE)
     cards = [
-        Card("the paper's numbers", str(len(said) - said.count(MORE)), f"{said.count(MORE)} more beside them"),
+        Card("the paper's numbers", str(total), f"{said.count(MORE)} more beside them"),
         Card("reproduced", str(said.count(AGREES)), "", "good"),
-        Card("differ for a reason", str(said.count(DIFFERS)), "with a number that shows it: read it"),
+        Card("differ for a reason", str(said.count(DIFFERS)), "the paper's with one thing changed"),
+        Card("slips", str(said.count(CORRECTED)), "what is printed is not what is right"),
         Card("not reproduced", str(bad), "", "bad" if bad else "good"),
         Card("time", duration(sum(one.seconds for one in outcomes)), f"{what['form']} form"),
     ]
@@ -37,7 +38,9 @@ def page(outcomes: Sequence[Any], what: Mapping[str, Any]) -> Page:
     return Page(
         title="Asad et al. (2015), run again",
         subtitle=f"{what['finished']}, {what['form']} form",
-        verdict="Every number is reproduced, or its difference explained." if not bad else f"{bad} not reproduced.",
+        verdict="Every number is reproduced, or its difference explained."
+        if not bad
+        else f"{bad} of {total} not reproduced.",
         mark="good" if not bad else "bad",
         cards=cards,
         sections=[*sections, Section("Repeat it", [*last, Text(known)])],

@@ -5,7 +5,7 @@ import pytest
 
 from instrument.paper import errata
 from instrument.paper.bench import Bench
-from instrument.paper.finding import DIFFERS
+from instrument.paper.finding import CORRECTED, NOT
 
 
 @pytest.mark.long
@@ -13,7 +13,7 @@ def test_every_slip_is_shown_to_be_one(tmp_path):
     every = errata.run(Bench(tmp_path, quick=True))
     found = {f.what: f for f in every}
     assert len(found) == len(every)  # run.json has them by name
-    assert {f.agreement for f in found.values()} == {DIFFERS}
+    assert {f.agreement for f in found.values()} == {CORRECTED}
     assert {int(what.split(".")[0]) for what in found} == set(range(1, 14))
     ours = {what.split(".")[0]: f.ours for what, f in found.items()}
     assert ours["7"] == pytest.approx(0.913 * 160 / 161, rel=2e-3)  # Nyquist, where 161 channels have their last delay
@@ -23,10 +23,10 @@ def test_every_slip_is_shown_to_be_one(tmp_path):
     assert ours["12"] == pytest.approx(np.sqrt(3.83 * 3.81), rel=0.02)  # of the whole night
 
 
-def test_a_printed_form_that_were_right_would_be_said_to_agree():
-    assert errata._slip("x", 1.0, "", "1", 1.0, "why").agreement == "agrees"
-    assert errata._slip("x", 1.02, "", "1", 1.0, "why").agreement == DIFFERS
-    assert errata._slip("x", -1.0, "", "-1", -1.0, "why").agreement == "agrees"
+def test_a_printed_form_that_were_right_or_ours_that_were_wrong_would_be_no_slip():
+    assert errata._slip("x", 1.0, "", "1", 1.02, "why", errata._near(1.0)).agreement == CORRECTED
+    assert errata._slip("x", 1.0, "", "1", 1.0, "why", errata._near(1.0)).agreement == NOT
+    assert errata._slip("x", 1.02, "", "1", 2.0, "why", errata._near(1.0)).agreement == NOT
 
 
 def test_the_first_order_matrix_is_of_second_order_only_with_the_i():

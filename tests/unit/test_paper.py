@@ -11,12 +11,13 @@ from instrument.cli import main
 from instrument.paper import command, ixr
 from instrument.paper.bench import Bench
 from instrument.paper.experiments import EXPERIMENTS, experiment
-from instrument.paper.finding import AGREES, DIFFERS, MORE, NOT, Finding, verdict
+from instrument.paper.finding import AGREES, CORRECTED, DIFFERS, MORE, NOT, Finding, verdict
 from instrument.paper.patch import around, rings, square
 from instrument.units import Direction
 
 SOUND = Finding("width", 3.8, "deg", "3.8", (3.7, 3.9))
-WHY = Finding("length", 129.0, "m", "127", (126.5, 127.5), "by survey 129.0 m", "130 m")
+WHY = Finding("length", 129.0, "m", "127", (126.5, 127.5), "by survey 129.0 m", "130 m", changed=127.1)
+SLIP = Finding("distance", 9.3, "Gpc", "2.1", (9.2, 9.4), "without c/H0 it is 2.1", changed=2.1, slip=True)
 MISSED = Finding("leakage", 0.5, "%", "0.3", (0.2, 0.4))
 BEYOND = Finding("depth", 7.0, "rad/m2")
 
@@ -28,10 +29,22 @@ def test_a_number_agrees_within_its_range_and_else_needs_a_reason():
     assert SOUND._replace(because="no reason is needed").agreement == AGREES
 
 
+@pytest.mark.parametrize("changed", [float("nan"), 126.0, 129.0])
+def test_a_reason_that_does_not_lead_into_the_range_is_none(changed):
+    assert WHY._replace(changed=changed).agreement == NOT
+    assert WHY._replace(because="").agreement == NOT
+
+
+def test_a_slip_is_one_where_ours_is_right_and_the_printed_form_is_not():
+    assert SLIP.agreement == CORRECTED
+    assert [SLIP._replace(**x).agreement for x in ({"ours": 9.5}, {"changed": 9.3}, {"changed": np.nan})] == [NOT] * 3
+    assert verdict([SLIP, BEYOND]) == "what is printed is not what is right, in 1 of 1 numbers"
+
+
 def test_the_verdict_is_that_of_the_worst_number():
     assert verdict([SOUND, BEYOND]) == "reproduced"
     assert verdict([SOUND, WHY, BEYOND]) == "reproduced, 1 of 2 with a reason for the difference"
-    assert verdict([SOUND, WHY, MISSED]) == "not reproduced: leakage"
+    assert verdict([SOUND, WHY, MISSED]) == "1 of 3 not reproduced: leakage"
     assert verdict([BEYOND]).startswith("beyond the paper")
 
 
