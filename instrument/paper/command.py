@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
@@ -10,13 +11,13 @@ from typing import Any, NamedTuple
 from instrument.errors import InputError, unused_ledger
 from instrument.memory import high_water
 from instrument.paper.bench import Bench
-from instrument.paper.experiments import EXPERIMENTS, chosen, experiment
+from instrument.paper.experiments import EXPERIMENTS, chosen, experiment, seconds
 from instrument.paper.finding import NOT, Finding, verdict
 from instrument.paper.page import page
 from instrument.pipeline.folder import RunFolder
 from instrument.pipeline.progress import progress_bar
 from instrument.pipeline.record import json_text, versions
-from instrument.report.page import FigureEntry, number, write_page
+from instrument.report.page import FigureEntry, duration, number, write_page
 from instrument.whole_file import write_ecsv
 
 
@@ -46,33 +47,59 @@ def paper(
 ) -> bool:
     """Run experiments (default: all) and write their folder; whether every number of the paper was reproduced.
 
-    A number that differs for a reason counts as reproduced. Raises `InputError` for a name that is none, or a seed
-    below 1.
+    A number that differs for a reason counts as reproduced. Where an experiment fails or is interrupted, those before
+    it are written, and the error goes on. Raises `InputError` for a name that is none, or a seed below 1.
     """
     every = chosen(names)
     if seed is not None and seed < 1:
         raise InputError(f"--seed {seed}: give a whole number of 1 or more, or leave it out for those of the scenes")
     outcomes: list[Outcome] = []
+    due = {name: seconds(name, quick) for name in every}
+    stopped: BaseException | None = None
     with RunFolder("-".join(["paper", *names]), out, force) as folder, progress_bar("paper") as bar, unused_ledger():
+        show(announced(due, quick))
         for k, name in enumerate(every):
-            bar(k / len(every), name)
+            bar(sum(due[n] for n in every[:k]) / sum(due.values()), name)
             bench = Bench(folder.partial / name, quick, seed)
-            bench.folder.mkdir()
-            begin = time.perf_counter()
-            findings = experiment(name)(bench)
-            if len({f.what for f in findings}) < len(findings):
-                raise ValueError(f"{name}: two findings are called the same, and run.json has them by name")
-            spent = time.perf_counter() - begin
-            outcomes.append(Outcome(name, findings, bench.figures, spent, high_water()))
+            try:
+                outcomes.append(_outcome(name, bench))
+            except BaseException as error:  # also Ctrl-C: half an hour of others is kept
+                if not outcomes:
+                    raise
+                stopped = error
+                shutil.rmtree(bench.folder)
+                break
             show("\n".join(lines(outcomes[-1])))
-        what = record(outcomes, quick, seed, command)
+        what = record(outcomes, quick, seed, command) | {"not_run": every[len(outcomes) :]}
         for one in outcomes:
             write_ecsv(table(one.findings), folder.partial / f"{one.name}.ecsv")
         (folder.partial / "paper.md").write_text(markdown(outcomes), encoding="utf-8")
         write_page(page(outcomes, what), folder.partial / "paper.html")
         (folder.partial / "run.json").write_text(json_text(what), encoding="utf-8")
         show(f"written to {folder.finish()}")
+        if stopped is not None:
+            show(f"of {len(every)} experiments {len(outcomes)} ended; not {', '.join(what['not_run'])}")
+            raise stopped
     return not any(f.agreement == NOT for one in outcomes for f in one.findings)
+
+
+def announced(due: dict[str, float], quick: bool) -> str:
+    """What will be done, and in about what time."""
+    longest = max(due, key=lambda name: due[name])
+    what = f"{len(due)} experiments, '{longest}' {duration(due[longest])} of it" if len(due) > 1 else f"'{longest}'"
+    return (
+        f"paper         {'quick' if quick else 'full'} form, about {duration(sum(due.values()))} on two cores: {what}"
+    )
+
+
+def _outcome(name: str, bench: Bench) -> Outcome:
+    """An experiment run."""
+    bench.folder.mkdir()
+    begin = time.perf_counter()
+    findings = experiment(name)(bench)
+    if len({f.what for f in findings}) < len(findings):
+        raise ValueError(f"{name}: two findings are called the same, and run.json has them by name")
+    return Outcome(name, findings, bench.figures, time.perf_counter() - begin, high_water())
 
 
 def lines(one: Outcome) -> list[str]:

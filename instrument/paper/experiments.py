@@ -25,6 +25,18 @@ EXPERIMENTS = {
     "ixr": ("ixr", "Leakage in dB, what must be removed, and the IXR of telescopes over their fields", "discussion"),
     "errata": ("errata", "Slips of the paper: the printed form beside the right one", "formulae and tables"),
 }
+# seconds of the quick and of the full form on two quiet cores: what is announced, and the steps of the bar
+SECONDS = {
+    "beam": (8, 9), "di-errors": (12, 106), "mock-grid": (20, 57), "3c196": (8, 247), "incomplete-model": (18, 66),
+    "aw-correction": (44, 632), "galactic": (25, 709), "gmca": (20, 64), "whole-way": (24, 131), "ixr": (5, 7),
+    "errata": (6, 5),
+}  # fmt: skip
+NEW = 10  # of one that nobody has timed
+
+
+def seconds(name: str, quick: bool) -> float:
+    """About how long an experiment takes on two cores."""
+    return SECONDS.get(name, (NEW, NEW))[0 if quick else 1]
 
 
 def chosen(names: Sequence[str]) -> list[str]:

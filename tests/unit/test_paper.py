@@ -10,7 +10,7 @@ from instrument import mueller
 from instrument.cli import main
 from instrument.paper import command, ixr
 from instrument.paper.bench import Bench
-from instrument.paper.experiments import EXPERIMENTS, experiment
+from instrument.paper.experiments import EXPERIMENTS, SECONDS, experiment
 from instrument.paper.finding import AGREES, CORRECTED, DIFFERS, MORE, NOT, Finding, verdict
 from instrument.paper.patch import around, rings, square
 from instrument.units import Direction
@@ -93,11 +93,35 @@ def test_a_folder_has_the_record_the_tables_the_text_and_the_page(tmp_path, scri
     assert (tmp_path / "p" / "one" / "line.png").stat().st_size > 1000
 
 
+@pytest.mark.parametrize("error", [ValueError("lost"), KeyboardInterrupt()])
+def test_what_has_ended_is_kept_where_an_experiment_fails(tmp_path, scripted, monkeypatch, error):
+    scripted(one=[SOUND], two=[MISSED], three=[BEYOND])
+
+    def fail(bench):
+        raise error
+
+    ordinary = command.experiment
+    monkeypatch.setattr(command, "experiment", lambda name: fail if name == "two" else ordinary(name))
+    said = []
+    with pytest.raises(type(error)):
+        command.paper(["one", "two", "three"], out=str(tmp_path / "p"), show=said.append)
+    assert said[-1] == "of 3 experiments 1 ended; not two, three" and "3 experiments" in said[0]
+    assert json.loads((tmp_path / "p" / "run.json").read_text())["not_run"] == ["two", "three"]
+    assert (tmp_path / "p" / "one.ecsv").exists() and not (tmp_path / "p" / "two").exists()
+    with pytest.raises(type(error)):
+        command.paper(["two", "three"], out=str(tmp_path / "q"), show=said.append)
+    assert not (tmp_path / "q").exists()
+
+
+def test_every_experiment_has_its_seconds():
+    assert set(SECONDS) == set(EXPERIMENTS)
+
+
 def test_a_number_that_is_not_reproduced_is_status_3(tmp_path, scripted, capsys):
     scripted(one=[MISSED])
     assert main(["paper", "one", "--out", str(tmp_path / "p")]) == 3
-    assert "one: not reproduced: leakage" in capsys.readouterr().out
-    assert "1 not reproduced" in (tmp_path / "p" / "paper.html").read_text()
+    assert "one: 1 of 1 not reproduced: leakage" in capsys.readouterr().out
+    assert "1 of 1 not reproduced" in (tmp_path / "p" / "paper.html").read_text()
 
 
 def test_two_folders_are_compared(tmp_path, scripted, capsys):
