@@ -1,11 +1,10 @@
 """The experiment `beam`: its quick form reproduces the paper, and has the leakage that EveryBeam has."""
 
 import numpy as np
+import paper_quick
 import pytest
 
 from instrument.paper import beam
-from instrument.paper.bench import Bench
-from instrument.paper.finding import NOT
 from instrument.paper.patch import square
 
 # mean over position angle at 1 to 4 deg, %, from EveryBeam's station beams of the pair, 150 MHz
@@ -19,8 +18,7 @@ EVERYBEAM = {
 
 @pytest.mark.long
 def test_the_beam_of_the_paper_and_of_everybeam(tmp_path):
-    found = {f.what: f for f in beam.run(Bench(tmp_path, quick=True))}
-    assert not [f.what for f in found.values() if f.agreement == NOT]
+    found = paper_quick.found("beam", tmp_path)
     for (name, when), values in EVERYBEAM.items():
         ours = [found[f"I to {name} {deg} deg from the centre, {when}"].ours for deg in (1, 2, 3, 4)]
         assert ours == pytest.approx(values, rel=0.01 if name == "linear" else 0.05)  # V has two digits there
