@@ -1,7 +1,6 @@
 """The experiment `beam`: its quick form reproduces the paper, and has the leakage that EveryBeam has."""
 
 import numpy as np
-import paper_quick
 import pytest
 
 from instrument.paper import beam
@@ -17,8 +16,8 @@ EVERYBEAM = {
 
 
 @pytest.mark.long
-def test_the_beam_of_the_paper_and_of_everybeam(tmp_path):
-    found = paper_quick.found("beam", tmp_path)
+def test_the_beam_of_the_paper_and_of_everybeam(tmp_path, paper_quick):
+    found = paper_quick("beam", tmp_path)
     for (name, when), values in EVERYBEAM.items():
         ours = [found[f"I to {name} {deg} deg from the centre, {when}"].ours for deg in (1, 2, 3, 4)]
         assert ours == pytest.approx(values, rel=0.01 if name == "linear" else 0.05)  # V has two digits there

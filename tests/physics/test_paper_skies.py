@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from paper_quick import found
 
 from instrument.paper.finding import DIFFERS
 
@@ -10,8 +9,8 @@ pytestmark = pytest.mark.long
 
 
 @pytest.fixture(scope="module")
-def di(tmp_path_factory):
-    return found("di-errors", tmp_path_factory.mktemp("di"))
+def di(tmp_path_factory, paper_quick):
+    return paper_quick("di-errors", tmp_path_factory.mktemp("di"))
 
 
 def test_gauge_is_that_of_other_solvers(di):
@@ -43,9 +42,9 @@ def test_errors_in_the_image_fall_with_the_root_of_the_integrations(di):
     assert 0.0189 < image.ours < 0.06  # fewer baselines are in our images
 
 
-def test_leakage_of_the_grid(tmp_path):
+def test_leakage_of_the_grid(tmp_path, paper_quick):
     """Another beam program has medians of 0.23, 0.41, 0.62, 0.89 % in rings (test_mock_grid.py holds the full form)."""
-    grid = found("mock-grid", tmp_path)
+    grid = paper_quick("mock-grid", tmp_path)
     rings = [grid[f"I to linear, {a:g} to {b:g} deg, median"].ours for a, b in ((0.1, 1), (1, 2), (2, 3), (3, 4))]
     assert rings == pytest.approx([0.23, 0.41, 0.62, 0.89], rel=0.08)
     assert grid["I to linear within 4 deg, median"].agreement == DIFFERS
@@ -58,15 +57,15 @@ def test_leakage_of_the_grid(tmp_path):
 
 
 @pytest.mark.parametrize("seed", [None, 5])
-def test_leakage_of_the_3c196_field(tmp_path, seed):
+def test_leakage_of_the_3c196_field(tmp_path, paper_quick, seed):
     """Rotated by a beam, what is in V comes from the same matrices: three orders below, whatever the sources are."""
-    field = found("3c196", tmp_path, seed)
+    field = paper_quick("3c196", tmp_path, seed)
     assert field["V below Q and U, orders of the rms"].ours == pytest.approx(2.9, abs=0.1)
     assert field["largest leakage of the 33 brightest, by the beam"].ours == pytest.approx(3.07, rel=0.05)
 
 
-def test_incomplete_models(tmp_path):
+def test_incomplete_models(tmp_path, paper_quick):
     """A source outside the model loses 2/59 of its flux, however many are in it; every step leaves less."""
-    sweep = found("incomplete-model", tmp_path)
+    sweep = paper_quick("incomplete-model", tmp_path)
     assert sweep["3C196 alone: flux that the others lose"].ours == pytest.approx(200 / 59, rel=0.2)
     assert sweep["solves that failed"].ours == 0

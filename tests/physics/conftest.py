@@ -1,5 +1,7 @@
 """Quick forms of the paper's experiments, and which of its numbers they are known to miss: no others, and no fewer."""
 
+import pytest
+
 from instrument.paper.bench import Bench
 from instrument.paper.experiments import experiment
 from instrument.paper.finding import NOT
@@ -21,7 +23,13 @@ MISSED = {
 }
 
 
-def found(name, folder, seed=None):
+@pytest.fixture(scope="session")
+def paper_quick():
+    """`paper_quick(name, folder, seed=None)`: findings of an experiment by what they are."""
+    return _found
+
+
+def _found(name, folder, seed=None):
     """Findings of an experiment by what they are."""
     bench = Bench(folder, quick=True, seed=seed)
     findings = experiment(name)(bench)
