@@ -7,11 +7,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from instrument.analyze.analyzer import Analyzer
 from instrument.analyze.faraday.band import FaradayBand
 from instrument.analyze.ixr import leakage_of_ixr
-from instrument.analyze.power.fourier import HYDROGEN, comoving
-from instrument.image.cube import StokesCube
 from instrument.jones.mueller import (
     TO_LINEAR,
     TO_STOKES,
@@ -24,7 +21,8 @@ from instrument.jones.mueller import (
 )
 from instrument.observe.directions import LIGHT
 from instrument.paper.bench import Bench
-from instrument.paper.finding import Finding
+from instrument.paper.errata_power import BAND_HZ, distance, nyquist, tone, volume
+from instrument.paper.finding import Finding, near, slip
 from instrument.paper.ixr import corrected, station
 from instrument.paper.patch import around, from_transit, rings, zenith
 from instrument.registry import load
@@ -32,7 +30,6 @@ from instrument.report.style import BLUE, ORANGE, styled
 from instrument.units import Complex, Float
 
 PAIR = ("CS001HBA0", "CS001HBA1")
-BAND_HZ = np.linspace(134e6, 166e6, 161)
 RADII = np.arange(0.5, 4.01, 0.5)  # deg
 
 
@@ -44,22 +41,11 @@ def run(bench: Bench) -> list[Finding]:
     scene = parse(bench.tables("mock-grid", f"instrument.stations={list(PAIR)}")).scene()
     false_v, first = _circular(scene), _first_order(rng)
     found = [
-        *_conjugate(false_v), *_order(first), *_half(), *_element(scene), *_resolution(), *_convolution(), *_nyquist(),
-        *_distance(), *_volume(rng), *_channels(), *_decibel(), *_psf(bench), *_density(bench),
+        *_conjugate(false_v), *_order(first), *_half(), *_element(scene), *_resolution(), *_convolution(), *nyquist(),
+        *distance(), *volume(rng), *_channels(), *_decibel(), *_psf(bench), *_density(bench),
     ]  # fmt: skip
     bench.draw("slips", _draw(false_v, first), "Slips 1, 2, 5 and 7: the printed form and the right one.", wide=True)
     return found
-
-
-def _slip(
-    what: str, ours: float, unit: str, paper: str, printed: float, because: str, right: tuple[float, float]
-) -> Finding:
-    """A number that must lie where it is `right` by other means than ours, and where the printed form gives another."""
-    return Finding(what, ours, unit, paper, right, because, changed=printed, slip=True)
-
-
-def _near(right: float, by: float = 0.01) -> tuple[float, float]:
-    return (1 - by) * right, (1 + by) * right
 
 
 def _percent(printed: float, ours: float) -> str:
@@ -88,7 +74,7 @@ def _conjugate(false_v: dict[str, Float]) -> list[Finding]:
         text = f"with J_b^H it is {wrong:.1f} %"
         what = f"1. I to V {deg} deg from the centre, transit, worst direction"
         # LOFAR makes no more of I into V than 0.003 %, by the paper itself
-        found.append(_slip(what, right, "%", "J_a kron J_b^H", wrong, text, (0.0, 0.003)))
+        found.append(slip(what, right, "%", "J_a kron J_b^H", wrong, text, (0.0, 0.003)))
     return found
 
 
@@ -113,7 +99,7 @@ def _order(first: dict[str, Float]) -> list[Finding]:
     excess = float(first["printed"][low] / first["right"][low])
     text = f"without the i in row V, column Q it grows {wrong:.1f} times; at 1e-3 it is {excess:.0f} times as large"
     what = "2. error of the first-order matrix at errors of 1e-2, over that at 1e-3"
-    return [_slip(what, right, "", "delta_QV, no i", wrong, text, _near(100.0, 0.05))]  # what is left is second order
+    return [slip(what, right, "", "delta_QV, no i", wrong, text, near(100.0, 0.05))]  # what is left is second order
 
 
 def _half() -> list[Finding]:
@@ -123,7 +109,7 @@ def _half() -> list[Finding]:
     kron = np.kron(j, j.conj())
     apart = np.abs(np.linalg.inv(0.5 * TO_LINEAR) @ kron @ (0.5 * TO_LINEAR) - mueller(j, j)).max()
     text = f"S with its 1/2 gives {wrong:g}, B without one {right:g}; Mueller matrices of the two differ by {apart:.0e}"
-    return [_slip("3. correlation pp of 1 Jy of I", right, "Jy", "B without 1/2, S with", wrong, text, _near(1.0))]
+    return [slip("3. correlation pp of 1 Jy of I", right, "Jy", "B without 1/2, S with", wrong, text, near(1.0))]
 
 
 def _element(scene: Any) -> list[Finding]:
@@ -141,7 +127,7 @@ def _element(scene: Any) -> list[Finding]:
     right, wrong = (100 * _spread(jones @ np.diag([1.0, sign]) @ level) for sign in (1, -1))
     text = f"with -p_phi it is {wrong:.0f} %: the dipoles turn the wrong way; the minus is in the coefficients already"
     return [
-        _slip(
+        slip(
             "4. element half a degree from the zenith, spread over azimuth",
             right,
             "%",
@@ -181,9 +167,9 @@ def _resolution() -> list[Finding]:
     width = (LIGHT / 134e6) ** 2 - (LIGHT / 166e6) ** 2  # of the RMSF of even weights: 3.79 over it
     shown = "5. resolution, half height of the RMSF"
     return [
-        _slip("5. resolution, 2 sqrt(3) / width in lambda2", band.fwhm_nominal, "rad/m2", "1", 1.0, text,
-              _near(2 * np.sqrt(3) / width)),
-        _slip(shown, band.fwhm, "rad/m2", "1", 1.0, half, _near(3.79 / width)),
+        slip("5. resolution, 2 sqrt(3) / width in lambda2", band.fwhm_nominal, "rad/m2", "1", 1.0, text,
+              near(2 * np.sqrt(3) / width)),
+        slip(shown, band.fwhm, "rad/m2", "1", 1.0, half, near(3.79 / width)),
     ]  # fmt: skip
 
 
@@ -202,85 +188,7 @@ def _convolution() -> list[Finding]:
     wrong = float(np.abs(folded[5]))
     even = np.pi  # what even weights of 1 give, exactly
     text = f"the printed convolution gives {wrong:.3g}: pi, and the weights once more ({_percent(wrong, even)})"
-    return [_slip("6. F of a source of 1, weights from 1 to 4", right, "", "RMSF * integral", wrong, text, _near(1.0))]
-
-
-def _cube(field: Float, freq_hz: Float) -> StokesCube:
-    from astropy import units as u
-
-    data = np.zeros((len(field), 4, *field.shape[1:]))
-    data[:, 0] = field
-    return StokesCube(data, freq_hz * u.Hz, 2 * u.arcmin, "K", constants="data")
-
-
-def _tone() -> tuple[Float, Float, float]:
-    """k_par of the printed axis, power on it of a tone, and the k_par of the tone."""
-    plain = Analyzer(_cube(np.ones((161, 16, 16)), BAND_HZ)).cylindrical(taper=None, bins=1)
-    cell = int(np.argmin(np.abs(plain.k_par - 0.3))) + 1
-    wave = np.cos(2 * np.pi * cell * np.arange(161) / 161)[:, None, None]
-    across = np.cos(2 * np.pi * 3 * np.arange(16) / 16)
-    drawn = Analyzer(_cube(wave * across, BAND_HZ)).cylindrical(taper=None, paper_axis=True, bins=1)
-    return drawn.k_par, drawn.power[0], float(plain.k_par[cell - 1])
-
-
-def _nyquist() -> list[Finding]:
-    noise = _cube(np.ones((161, 16, 16)), BAND_HZ)
-    last, printed = (
-        float(Analyzer(noise).cylindrical(taper=None, bins=1, paper_axis=which).k_par[-1]) for which in (False, True)
-    )
-    k, power, at = _tone()
-    twice = k[power > power.max() / 2]
-    text = f"a tone at {at:.3f} /Mpc is drawn at {' and '.join(f'{x:.3f}' for x in twice)}: the rest is a mirror image"
-    from astropy.cosmology import Planck15
-
-    z = HYDROGEN / 150e6 - 1
-    depth = LIGHT / 1e3 * (1 + z) ** 2 / (Planck15.H(z).value * HYDROGEN)  # Mpc/Hz
-    # pi over the depth of a channel; the last cell of 161 is 160/161 of it
-    nyquist = np.pi / (0.2e6 * depth)
-    what = "7. largest k_par of channels of 0.2 MHz"
-    return [_slip(what, last, "/Mpc", "1/dnu: 1.85", printed, text, (0.98 * nyquist, nyquist))]
-
-
-def _distance() -> list[Finding]:
-    from astropy.cosmology import Planck15
-
-    z, mpc = comoving(150e6, None, None)
-    unit = float(Planck15.hubble_distance.to_value("Mpc"))
-    text = f"the printed integral is {mpc / unit:.3f}, a number without c/H0 = {unit:.0f} Mpc"
-    return [
-        _slip(
-            f"8. comoving distance at z = {z:.2f}", mpc, "Mpc", "no c/H0", mpc / unit, text, _near(_integral(z), 3e-3)
-        )
-    ]
-
-
-def _integral(z: float) -> float:
-    """Comoving distance in Mpc of flat cold matter and a constant (Planck 2015), summed by the trapezium rule."""
-    from astropy.cosmology import Planck15
-
-    steps = np.linspace(0.0, z, 100_001)
-    matter, radiation = Planck15.Om0 + Planck15.Onu0, Planck15.Ogamma0  # neutrinos of which most have mass, as matter
-    rate = np.sqrt(matter * (1 + steps) ** 3 + radiation * (1 + steps) ** 4 + 1 - matter - radiation)
-    return float(LIGHT / 1e3 / Planck15.H0.value * np.trapezoid(1 / rate, steps))
-
-
-def _volume(rng: Any) -> list[Finding]:
-    def both(count: int) -> tuple[float, float]:
-        """Variance of a cube, from its power summed over cells: as it should be, and without the volume factor."""
-        freq = BAND_HZ[:count]
-        field = rng.normal(size=(count, 32, 32))
-        field /= field.std()
-        cells = Analyzer(_cube(field, freq)).cylindrical(taper=None, bins=1)
-        frame = cells.frame
-        side = 32 * np.deg2rad(2 / 60) * frame.distance_mpc
-        volume = side**2 * count * (freq[1] - freq[0]) * frame.depth_mpc_per_hz
-        square = float(np.sum(np.abs(np.fft.fftn(field)) ** 2)) / volume
-        return float(np.nansum(cells.power * cells.count) / np.nansum(cells.count) * field.size / volume), square
-
-    right, wrong = both(161)
-    half = both(80)[1]
-    text = f"the printed square gives {wrong:.3g}, and {half:.3g} for half of the channels: it is no power of a field"
-    return [_slip("9. variance of a field of 1 K from its power", right, "K2", "no volume", wrong, text, _near(1.0))]
+    return [slip("6. F of a source of 1, weights from 1 to 4", right, "", "RMSF * integral", wrong, text, near(1.0))]
 
 
 def _channels() -> list[Finding]:
@@ -288,7 +196,7 @@ def _channels() -> list[Finding]:
     wrong = (len(BAND_HZ) - 1) * 0.19
     width = right / (len(BAND_HZ) - 1)
     text = f"160 steps of 0.19 MHz span {wrong:.1f} MHz; {right:.1f} MHz takes {width:.2f} MHz"
-    return [_slip("10. what 161 channels span", right, "MHz", "161 of 0.19", wrong, text, _near(166.0 - 134.0))]
+    return [slip("10. what 161 channels span", right, "MHz", "161 of 0.19", wrong, text, near(166.0 - 134.0))]
 
 
 def _decibel() -> list[Finding]:
@@ -296,8 +204,8 @@ def _decibel() -> list[Finding]:
     after = corrected(before, 0.3)
     right, other = (10 * np.log10(ixr(after) / ixr(before)) for ixr in (ixr_mueller, ixr_jones))
     text = f"25 dB and the step of IXR_J, {other:.1f} dB, are {25 + other:.1f} dB: {10 - right:.1f} dB too much"
-    return [_slip("11. IXR_M of 25 dB with 30 % of the leakage left", 25 + float(right), "dB", "35", 35.0, text,
-                  _near(25 - 10 * np.log10(0.3), 0.005))]  # fmt: skip
+    return [slip("11. IXR_M of 25 dB with 30 % of the leakage left", 25 + float(right), "dB", "35", 35.0, text,
+                  near(25 - 10 * np.log10(0.3), 0.005))]  # fmt: skip
 
 
 def _psf(bench: Bench) -> list[Finding]:
@@ -317,7 +225,7 @@ def _psf(bench: Bench) -> list[Finding]:
     for where, printed in (("caption", "3"), ("table", "4.3")):
         wrong = float(printed)
         because = f"{text} is {_percent((mean / wrong) ** 2, 1)}"
-        found.append(_slip(f"12. PSF, beside the {where}", mean, "arcmin", printed, wrong, because, _near(disc, 0.05)))
+        found.append(slip(f"12. PSF, beside the {where}", mean, "arcmin", printed, wrong, because, near(disc, 0.05)))
     return found
 
 
@@ -341,8 +249,8 @@ def _density(bench: Bench) -> list[Finding]:
     spans = [(min(pair), max(pair)) for pair in zip(*ends, strict=True)]
     told = (f"the mock has {made / count:.2f} times it", f"the mock has {jansky:.1f} Jy, as printed")
     return [
-        _slip(f"{what} sources above 27 mJy", count, "", "4567", made, told[0], spans[0]),
-        _slip(f"{what} flux without 3C196", total, "Jy", "713.6", jansky, told[1], spans[1]),
+        slip(f"{what} sources above 27 mJy", count, "", "4567", made, told[0], spans[0]),
+        slip(f"{what} flux without 3C196", total, "Jy", "713.6", jansky, told[1], spans[1]),
     ]
 
 
@@ -366,7 +274,7 @@ def _draw(false_v: dict[str, Float], first: dict[str, Float]) -> Figure:
     for width, colour, label in ((band.fwhm, BLUE, f"{band.fwhm:.2f}"), (1.0, ORANGE, "1, printed")):
         five.plot([-width / 2, width / 2], [0.5, 0.5], color=colour, marker="|", markersize=12, label=label)
     five.set(title="5. resolution", xlabel="Faraday depth (rad/m2)")
-    k, power, at = _tone()
+    k, power, at = tone()
     half = k <= k[-1] / 2 * 1.01
     seven.plot(k, power / power.max(), color=ORANGE, label="printed axis")
     seven.plot(k[half], power[half] / power.max(), color=BLUE, label="up to Nyquist")

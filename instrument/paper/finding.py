@@ -42,6 +42,18 @@ class Finding(NamedTuple):
         return DIFFERS if self.because and changed else NOT
 
 
+def slip(
+    what: str, ours: float, unit: str, paper: str, printed: float, because: str, right: tuple[float, float]
+) -> Finding:
+    """A number that must lie where it is `right` by other means than ours, and where the printed form gives another."""
+    return Finding(what, ours, unit, paper, right, because, changed=printed, slip=True)
+
+
+def near(right: float, by: float = 0.01) -> tuple[float, float]:
+    """A range about a number."""
+    return (1 - by) * right, (1 + by) * right
+
+
 def verdict(findings: Sequence[Finding]) -> str:
     """The last line of an experiment: reproduced, reproduced with a reason for the difference, or not."""
     said = [finding.agreement for finding in findings if finding.agreement != MORE]

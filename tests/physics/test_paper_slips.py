@@ -5,7 +5,7 @@ import pytest
 
 from instrument.paper import errata
 from instrument.paper.bench import Bench
-from instrument.paper.finding import CORRECTED, NOT
+from instrument.paper.finding import CORRECTED, NOT, near, slip
 
 
 @pytest.mark.long
@@ -24,9 +24,9 @@ def test_every_slip_is_shown_to_be_one(tmp_path):
 
 
 def test_a_printed_form_that_were_right_or_ours_that_were_wrong_would_be_no_slip():
-    assert errata._slip("x", 1.0, "", "1", 1.02, "why", errata._near(1.0)).agreement == CORRECTED
-    assert errata._slip("x", 1.0, "", "1", 1.0, "why", errata._near(1.0)).agreement == NOT
-    assert errata._slip("x", 1.02, "", "1", 2.0, "why", errata._near(1.0)).agreement == NOT
+    assert slip("x", 1.0, "", "1", 1.02, "why", near(1.0)).agreement == CORRECTED
+    assert slip("x", 1.0, "", "1", 1.0, "why", near(1.0)).agreement == NOT
+    assert slip("x", 1.02, "", "1", 2.0, "why", near(1.0)).agreement == NOT
 
 
 def test_the_first_order_matrix_is_of_second_order_only_with_the_i():
