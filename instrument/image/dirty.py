@@ -18,6 +18,7 @@ from instrument.image.psf import fit_psf
 from instrument.image.sparse import FEW, Comb, Span
 from instrument.image.weights import Density, Weighting
 from instrument.jones import mueller
+from instrument.memory import give_back
 from instrument.observe.directions import LIGHT
 from instrument.predict.gridding import Gridder
 from instrument.predict.operator import ImageOperator
@@ -287,6 +288,7 @@ class Images(ImageSums):
                 if channel.crossed is not None and channel.weight[[0, 2]].all():
                     apart = max(apart, float(np.abs(channel.crossed / channel.weight[2] - psfs[f]).max()))
             del channel.sums  # a sum and its image at once: twice the cube for one channel only
+            give_back()  # or the C library keeps what was freed between what was not
         if not any(self.channels[f].weight.any() for f in freqs):
             raise RefusedError(f"no visibility lies within uv_range = {self.imager.uv_range} with a weight above 0")
         if apart > ALIKE:
