@@ -126,7 +126,7 @@ def tables(runs):
             std = known.get((name, text["what"]), (0.0, 0))[0]
             ours = number(float(row["ours"])) + (f" ± {number(std, 2)}" if std > 0 else "")
             why = "; ".join(text[key] for key in ("agreement", "because", "since") if text[key])
-            lines.append(f"| {text['what']} | {ours} {text['unit']} | {text['paper']} | {why} |")
+            lines.append(f"| {text['what']} | {ours} {text['unit']} | {text['asked']} | {why} |")
         assert len(run["numbers"][name]) == len(lines) - 2
         parts.append("\n".join(lines))
         parts += [f"![{name}: {figure}](reports/paper/{name}_{figure}.png)" for figure in SHOWN[name]]

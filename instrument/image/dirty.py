@@ -18,6 +18,7 @@ from instrument.image.psf import fit_psf
 from instrument.image.sparse import FEW, Comb, Span
 from instrument.image.weights import Density, Weighting
 from instrument.jones import mueller
+from instrument.memory import give_back
 from instrument.observe.directions import LIGHT
 from instrument.predict.gridding import Gridder
 from instrument.predict.operator import ImageOperator
@@ -25,6 +26,7 @@ from instrument.units import Complex, Float, Int
 from instrument.visibilities import Visibilities, VisibilitySet
 from instrument.visibility_sets import as_set
 
+FREED = 64e6  # bytes freed, after which the system gets them back
 HELD = 400_000  # visibilities or samples of a channel gridded at once: more makes 512 pixels 6 % cheaper at most
 ALL_HELD = 5 * HELD  # visibilities that wait in all channels together, and samples (unless `_few`): 192 and 160 MB
 ALIKE = 1e-3  # of the peak, by which the PSF of U and V may differ from that of I unsaid
@@ -276,7 +278,7 @@ class Images(ImageSums):
             raise RefusedError("no block of visibilities was given: nothing to image")
         pixels = self.imager.pixels
         planes, psfs = np.empty((len(freqs), 4, pixels, pixels)), np.empty((len(freqs), pixels, pixels))
-        apart = 0.0
+        apart, freed = 0.0, 0
         for f, freq in enumerate(freqs):
             channel = self.channels[freq]
             self._grid(channel)
@@ -286,7 +288,11 @@ class Images(ImageSums):
                 np.divide(channel.sums[4], channel.weight[0], out=psfs[f])
                 if channel.crossed is not None and channel.weight[[0, 2]].all():
                     apart = max(apart, float(np.abs(channel.crossed / channel.weight[2] - psfs[f]).max()))
+            freed += channel.sums.nbytes
             del channel.sums  # a sum and its image at once: twice the cube for one channel only
+            if freed > FREED:
+                give_back()  # or the C library keeps what was freed between what was not
+                freed = 0
         if not any(self.channels[f].weight.any() for f in freqs):
             raise RefusedError(f"no visibility lies within uv_range = {self.imager.uv_range} with a weight above 0")
         if apart > ALIKE:

@@ -83,7 +83,7 @@ def _length(scene: Any) -> Finding:
         f"surveyed positions; not explained: projected towards 3C196 it is {seen[len(HOURS) // 2]:.1f} m at transit, "
         f"{seen.min():.1f} to {seen.max():.1f} m over the night"
     )
-    return Finding("length of the baseline", length, "m", "127", since=text)  # an input of the paper, not a result
+    return Finding("length of the baseline", length, "m", "127", (126.5, 127.5), text)  # an input of the paper
 
 
 def _towards(scene: Any, l: Float, m: Float, hours: Any, freq_hz: Float) -> Complex:

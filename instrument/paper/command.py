@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from instrument.errors import InputError, unused_ledger
 from instrument.memory import high_water
+from instrument.numbers import brief
 from instrument.paper.bench import Bench
 from instrument.paper.experiments import EXPERIMENTS, chosen, experiment, seconds
 from instrument.paper.finding import NOT, Finding, verdict
@@ -48,11 +49,12 @@ def paper(
     """Run experiments (default: all) and write their folder; whether every number of the paper was reproduced.
 
     A number that differs for a reason counts as reproduced. Where an experiment fails or is interrupted, those before
-    it are written, and the error goes on. Raises `InputError` for a name that is none, or a seed below 1.
+    it are written, in a folder of their own where there was one already, and the error goes on. Raises `InputError`
+    for a name that is none, or a seed below 1.
     """
     every = chosen(names)
-    if seed is not None and seed < 1:
-        raise InputError(f"--seed {seed}: give a whole number of 1 or more, or leave it out for those of the scenes")
+    if seed is not None and not 1 <= seed < 2**31:
+        raise InputError(f"--seed {brief(seed)}: give 1 to 2147483647, or leave it out for the seeds of the scenes")
     outcomes: list[Outcome] = []
     due = {name: seconds(name, quick) for name in every}
     stopped: BaseException | None = None
@@ -73,9 +75,12 @@ def paper(
         what = record(outcomes, quick, seed, command) | {"not_run": every[len(outcomes) :]}
         for one in outcomes:
             write_ecsv(table(one.findings), folder.partial / f"{one.name}.ecsv")
-        (folder.partial / "paper.md").write_text(markdown(outcomes), encoding="utf-8")
+        left = f"Not run: {', '.join(what['not_run'])}.\n\n" if stopped else ""
+        (folder.partial / "paper.md").write_text(left + markdown(outcomes), encoding="utf-8")
         write_page(page(outcomes, what), folder.partial / "paper.html")
         (folder.partial / "run.json").write_text(json_text(what), encoding="utf-8")
+        if stopped is not None:
+            folder.beside()
         show(f"written to {folder.finish()}")
         if stopped is not None:
             show(f"of {len(every)} experiments {len(outcomes)} ended; not {', '.join(what['not_run'])}")
@@ -108,8 +113,8 @@ def lines(one: Outcome) -> list[str]:
     wide = max((len(f.what) for f in one.findings), default=0)
     for f in one.findings:
         ours = f"{number(f.ours)} {f.unit}".strip()
-        paper = f"paper: {f.paper}" if f.paper else ""
-        out.append(f"  {f.what:<{wide}}  {ours:<14} {paper:<32} {f.agreement}".rstrip())
+        paper = f"paper: {f.asked}" if f.asked else ""
+        out.append(f"  {f.what:<{wide}}  {ours:<14} {paper:<38} {f.agreement}".rstrip())
         out += [f"      {text}" for text in (f.because, f.since) if text]
     return [*out, f"{one.name}: {one.verdict} ({one.seconds:.0f} s)"]
 
@@ -137,7 +142,8 @@ def table(findings: Sequence[Finding]) -> Any:
 
     low, high = ([float("nan") if f.within is None else f.within[k] for f in findings] for k in (0, 1))
     columns = {key: [getattr(f, key) for f in findings] for key in ("what", "ours", "unit", "paper")}
-    last = {key: [getattr(f, key) for f in findings] for key in ("agreement", "because", "since")}
+    told = ("asked", "changed", "slip", "agreement", "because", "since")
+    last = {key: [getattr(f, key) for f in findings] for key in told}
     return Table({**columns, "low": low, "high": high, **last})
 
 
@@ -156,4 +162,4 @@ def markdown(outcomes: Sequence[Outcome]) -> str:
 
 def _row(f: Finding) -> str:
     said = "; ".join(text for text in (f.agreement, f.because, f.since) if text)
-    return f"| {f.what} | {number(f.ours)} {f.unit} | {f.paper} | {said} |\n".replace("  ", " ")
+    return f"| {f.what} | {number(f.ours)} {f.unit} | {f.asked} | {said} |\n".replace("  ", " ")

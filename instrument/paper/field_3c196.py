@@ -46,7 +46,8 @@ def run(bench: Bench) -> list[Finding]:
     return [
         # "up to 4 %", and "most" below 2: none above 4, some above 2
         Finding("largest leakage of the 33 brightest, by the beam", float(of_beam.max()), "%", "up to 4", (2.0, 4.0)),
-        Finding("share of the 33 below 2 %, measured", 100 * float(np.mean(measured < 2)), "%", "most", (50.0, 100.0)),
+        Finding("share of them below 2 %, by the beam", 100 * float(np.mean(of_beam < 2)), "%", "most", (50.0, 100.0)),
+        Finding("the same, measured", 100 * float(np.mean(measured < 2)), "%"),
         Finding("largest measured, of those known to 0.25 % of I", float(measured[clear].max()), "%"),
         Finding("how many of the 33 those are", float(clear.sum())),
         *[

@@ -30,6 +30,15 @@ class Finding(NamedTuple):
     slip: bool = False
 
     @property
+    def asked(self) -> str:
+        """What the paper prints, and the range that this was taken to mean."""
+        if self.within is None:
+            return self.paper
+        low, high = (f"{x:.4g}" for x in self.within)
+        span = f"{low} to {high}" if np.isfinite(self.within[1]) else f"above {low}"
+        return f"{self.paper} ({'right: ' * self.slip}{span})"
+
+    @property
     def agreement(self) -> str:
         """Whether the paper's number is reproduced."""
         if self.within is None:
@@ -62,7 +71,9 @@ def verdict(findings: Sequence[Finding]) -> str:
         return f"{len(missed)} of {len(said)} not reproduced: {'; '.join(missed)}"
     if not said:
         return "beyond the paper: it has no number to hold ours against"
-    if CORRECTED in said:
-        return f"what is printed is not what is right, in {said.count(CORRECTED)} of {len(said)} numbers"
-    count = said.count(DIFFERS)
-    return f"reproduced, {count} of {len(said)} with a reason for the difference" if count else "reproduced"
+    slips, count = said.count(CORRECTED), said.count(DIFFERS)
+    if slips == len(said):
+        return f"what is printed is not what is right, in {slips} of {slips} numbers"
+    parts = [f"{count} of {len(said)} with a reason for the difference"] * bool(count)
+    parts += [f"{slips} of {len(said)} by what the paper should have"] * bool(slips)
+    return ", ".join(["reproduced", *parts])

@@ -81,39 +81,39 @@ def _depths(bench: Bench, kelvin: StokesCube) -> list[Finding]:
 
     axis = np.arange(-60, 61) / 4
     inside = np.hypot(*np.meshgrid(kelvin.grid.east, kelvin.grid.north)) < np.deg2rad(HALF_POWER_DEG)
+    power: dict[str, Float] = {}
     tops, inner = {}, np.hypot(*np.meshgrid(kelvin.grid.east, kelvin.grid.north)) < np.deg2rad(INNER_DEG / 2)
     for stokes in ("P", "I"):
         depth = Analyzer(kelvin).rm_synthesis(axis, stokes=stokes)
         height = np.abs(depth.data)
         brightest = float(axis[np.argmax((height[:, inside] ** 2).mean(axis=1))])
         tops[stokes] = brightest, float(height[:, inside].max()), float(height[:, inner].max())
+        power[stokes] = (height[:, inside] ** 2).mean(axis=1)
         slices = [float(tops["P"][0]), 0.0] if stokes == "P" else [0.0, float(tops["P"][0])]
         bench.draw(f"faraday_{stokes}", faraday_slices(depth, slices), f"Stokes {stokes} in Faraday depth.", wide=True)
-        if stokes == "I":
-            at_zero = float(100 * (height[:, inside] ** 2).mean(axis=1)[np.argmin(np.abs(axis))])
-            at_zero /= float((height[:, inside] ** 2).mean(axis=1).max())
         del depth, height
-    peak, nearer = (5e3 * tops["I"][k] / tops["P"][1] for k in (1, 2))
+    peak, nearer = (5e3 * tops["I"][k] / tops["P"][k] for k in (1, 2))
+    zero, there = (float(power["I"][np.argmin(np.abs(axis - depth))]) for depth in (0.0, tops["P"][0]))
     fwhm = FaradayBand.of(kelvin.freq_hz * u.Hz).fwhm
     return [
+        # "at depth 0": there is more of it than at the depth of what leaks
         Finding(
-            "Faraday depth of the leakage into I, brightest",
-            tops["I"][0],
-            "rad/m²",
-            "0",
-            (-fwhm / 2, fwhm / 2),
-            f"I is real, so that its depths are those of P and their negatives; the RMSF is {fwhm:.2f} rad/m² wide, "
-            f"and at 0 there is {at_zero:.0f} % of the power at the brightest",
+            "I at Faraday depth 0 over I at that of P, power",
+            zero / there,
+            "",
+            "at depth 0",
+            (1.0, np.inf),
+            f"I is real: its depths are those of P and their negatives; the RMSF is {fwhm:.2f} rad/m² wide",
         ),
-        Finding("Faraday depth of P, brightest", tops["P"][0], "rad/m²", "1.2", (1.2 - fwhm / 2, 1.2 + fwhm / 2)),
+        Finding("Faraday depth of the leakage into I, brightest", tops["I"][0], "rad/m²"),
+        Finding("Faraday depth of P, brightest", tops["P"][0], "rad/m²", since="the paper: 1.2, and so the mock"),
         Finding(
             "peak of the leakage for 5 K of P, inside half power",
             peak,
             "mK",
             "10 to 15",
             (10.0, 15.0),
-            f"within {INNER_DEG / 2} deg it is {nearer:.1f}: leakage grows with the distance, and the mock sky has its "
-            "bright places where the seed puts them",
+            f"within {INNER_DEG / 2} deg, I and P, it is {nearer:.1f}: leakage grows with the distance",
             changed=nearer,
         ),
     ]
@@ -142,9 +142,9 @@ def _windows(found: Seen, quiet: Seen, signal: Signal21cm) -> list[Finding]:
     over = [_excess(seen.sphere, seen.sphere.delta2, signal) for seen in (found, quiet)]
     louder = _louder(found.sphere, quiet.sphere, signal)
     return [
-        # bins are a factor of 1.3 wide in k_par; the band of the quick form ends at 0.37
-        Finding("window open up to k_par", top, "/Mpc", "about 0.5", (min(0.35, 0.9 * nyquist), 0.7)),
-        Finding("the same, 70 % of the leakage removed", more, "/Mpc", "about 1", (0.9 * nyquist, 1.0)),
+        # bins are a factor of 1.3 wide in k_par; the channels of the quick form end at 0.37, and cannot tell
+        Finding("window open up to k_par", top, "/Mpc", "about 0.5", _told((0.35, 0.7), nyquist)),
+        Finding("the same, 70 % of the leakage removed", more, "/Mpc", "about 1", _told((0.8, 1.0), nyquist)),
         Finding(
             "k up to which the spherical leakage is below the signal",
             over[0],
@@ -158,6 +158,11 @@ def _windows(found: Seen, quiet: Seen, signal: Signal21cm) -> list[Finding]:
         Finding("window open up to k_par, without noise in Q and U", quiet.window.reach()[1], "/Mpc"),
         Finding("share of the window's bins that are open", 100 * found.window.area()[1], "%"),
     ]
+
+
+def _told(within: tuple[float, float], nyquist: float) -> tuple[float, float] | None:
+    """A range, or none where channels end below it and cannot tell."""
+    return within if nyquist > within[0] + 0.2 * (within[1] - within[0]) else None
 
 
 def _seen(cube: StokesCube, reach: tuple[float, float]) -> Seen:

@@ -38,17 +38,24 @@ def page(outcomes: Sequence[Any], what: Mapping[str, Any]) -> Page:
     return Page(
         title="Asad et al. (2015), run again",
         subtitle=f"{what['finished']}, {what['form']} form",
-        verdict="Every number is reproduced, or its difference explained."
-        if not bad
-        else f"{bad} of {total} not reproduced.",
-        mark="good" if not bad else "bad",
+        verdict=_verdict(bad, total, what["not_run"]),
+        mark="bad" if bad or what["not_run"] else "good",
         cards=cards,
         sections=[*sections, Section("Repeat it", [*last, Text(known)])],
         footer=f"instrument {what['versions']['instrument']}",
     )
 
 
+def _verdict(bad: int, total: int, not_run: Sequence[str]) -> str:
+    """The line under the title."""
+    stopped = f" Stopped before the end: {', '.join(not_run)} not run." if not_run else ""
+    if bad:
+        return f"{bad} of {total} not reproduced.{stopped}"
+    every = "Every number is reproduced, or its difference explained." if total else "Beyond the paper."
+    return f"Of what was run: {every}{stopped}" if stopped else every
+
+
 def _cells(f: Finding) -> list[Any]:
     why = " ".join(text for text in (f.because, f.since) if text)
     ours = Cell(f"{number(f.ours)} {f.unit}".strip(), numeric=True)
-    return [f.what, ours, f.paper, Cell(f.agreement, mark=MARKS.get(f.agreement, "")), why]
+    return [f.what, ours, f.asked, Cell(f.agreement, mark=MARKS.get(f.agreement, "")), why]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import itertools
 import json
 import os
 import shutil
@@ -62,6 +63,12 @@ class RunFolder:
                 folder.rmdir()
         if self._lock is not None:
             os.close(self._lock)
+
+    def beside(self) -> None:
+        """Leave what stands in the place, which `force` would replace: the name gets "-stopped", and is a free one."""
+        if self.path.exists():
+            names = (f"{self.path.name}-stopped{f'-{k}' if k else ''}" for k in itertools.count())
+            self.path = next(p for p in map(self.path.with_name, names) if not p.exists())
 
     def finish(self) -> Path:
         """Move what was written to its place; the path, which is the next free one where another run took the name."""

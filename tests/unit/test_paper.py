@@ -86,8 +86,8 @@ def test_a_folder_has_the_record_the_tables_the_text_and_the_page(tmp_path, scri
     assert list(table["agreement"]) == [AGREES, DIFFERS] and table["low"][1] == 126.5
     assert np.isnan(Table.read(tmp_path / "p" / "two.ecsv")["high"][0])
     text = (tmp_path / "p" / "paper.md").read_text()
-    assert "### `one`: title of one" in text and "| width | 3.80 deg | 3.8 | agrees |" in text
-    assert "| length | 129 m | 127 | differs, for a reason; by survey 129.0 m; 130 m |" in text
+    assert "### `one`: title of one" in text and "| width | 3.80 deg | 3.8 (3.7 to 3.9) | agrees |" in text
+    assert "| length | 129 m | 127 (126.5 to 127.5) | differs, for a reason; by survey 129.0 m; 130 m |" in text
     page = (tmp_path / "p" / "paper.html").read_text()
     assert "Every number is reproduced" in page and "by survey 129.0 m" in page and "A line." in page
     assert (tmp_path / "p" / "one" / "line.png").stat().st_size > 1000
@@ -108,6 +108,14 @@ def test_what_has_ended_is_kept_where_an_experiment_fails(tmp_path, scripted, mo
     assert said[-1] == "of 3 experiments 1 ended; not two, three" and "3 experiments" in said[0]
     assert json.loads((tmp_path / "p" / "run.json").read_text())["not_run"] == ["two", "three"]
     assert (tmp_path / "p" / "one.ecsv").exists() and not (tmp_path / "p" / "two").exists()
+    page = (tmp_path / "p" / "paper.html").read_text()
+    assert "two, three not run" in page and "Not run: two, three" in (tmp_path / "p" / "paper.md").read_text()
+    whole = tmp_path / "whole"
+    command.paper(["one", "three"], out=str(whole), show=said.append)
+    with pytest.raises(type(error)):  # a run that is stopped replaces none that is whole
+        command.paper(["one", "two"], out=str(whole), show=said.append, force=True)
+    assert json.loads((whole / "run.json").read_text())["not_run"] == []
+    assert json.loads((tmp_path / "whole-stopped" / "run.json").read_text())["not_run"] == ["two"]
     with pytest.raises(type(error)):
         command.paper(["two", "three"], out=str(tmp_path / "q"), show=said.append)
     assert not (tmp_path / "q").exists()
@@ -144,7 +152,7 @@ def test_an_unknown_experiment_is_one_line_and_leaves_nothing(tmp_path, capsys, 
 
 def test_a_seed_that_would_be_none_is_refused(tmp_path, capsys):
     assert main(["paper", "ixr", "--seed", "0", "--out", str(tmp_path / "p")]) == 2
-    assert capsys.readouterr().err.count("--seed 0: give a whole number of 1 or more") == 1
+    assert capsys.readouterr().err.count("--seed 0: give 1 to 2147483647") == 1
     assert not list(tmp_path.iterdir())
 
 
