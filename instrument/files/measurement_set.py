@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ from instrument.files.ms_frame import Frame, beam_state_of, frame_of
 from instrument.files.ms_tables import column, demand, opened, told
 from instrument.observe.closure import stations_seen
 from instrument.observe.directions import earth_frame
+from instrument.observe.recorded import Recorded
 from instrument.observe.sampling import Sampling, times_of
 from instrument.store import Store
 from instrument.units import Bool, Complex, Float, Int
@@ -23,6 +25,7 @@ from instrument.visibilities import Visibilities, VisibilitySet
 from instrument.visibility_sets import BLOCK_BYTES, VisibilityFile, as_set
 
 AT_ONCE = 1_000_000  # rows of what tells where the rows are
+BLOCK_ROWS = 10_000  # of a new column that are written at once
 SAME_S = 1e-3  # times as near as this are one
 NEEDED = ("TIME", "INTERVAL", "ANTENNA1", "ANTENNA2", "DATA_DESC_ID", "FIELD_ID", "UVW", "FLAG")
 
@@ -84,6 +87,20 @@ class MeasurementSet(VisibilitySet):
     def freq_hz(self) -> Float:
         """Channel centres, Hz (F,), ascending."""
         return self.frame.freq_hz
+
+    def observation(self) -> Recorded:
+        """The observation that the set holds, for a `Scene` that is predicted with its times, channels and UVW.
+
+        Raises `InputError` where the UVW are not those of stations, or integrations are not equally long.
+        """
+        rows, parts = self.rows, [block.at for block in self.blocks()]
+        if any(at.own_uvw_m is None for at in parts):
+            raise InputError(f"{self.path}: its UVW do not close around triangles of stations: nothing is predicted")
+        if np.ptp(rows.interval_s) > SAME_S:
+            raise InputError(f"{self.path}: integrations of {rows.interval_s.min():g} to {rows.interval_s.max():g} s")
+        at = replace(parts[0].at_centre(), slots_s=rows.slots_s, own_uvw_m=np.concatenate([p.uvw_m for p in parts]))
+        width = self.frame.width_hz
+        return Recorded.of(at, float(rows.interval_s[0]), float(width[0]) if np.ptp(width) == 0 else None)
 
     def blocks(self) -> Iterator[Visibilities]:
         """Blocks in order of time, all channels each."""
@@ -155,9 +172,9 @@ class MeasurementSet(VisibilitySet):
             return out.reshape(*shape, *values.shape[1:])
 
         data = frame.linear(self._cube(table, self.column, numbers))
-        flags = self._cube(table, "FLAG", numbers)
+        flags = self._cube(table, "FLAG", numbers).astype(bool)
         if "FLAG_ROW" in table.columns():
-            flags = flags | _at(table, "FLAG_ROW", numbers)[:, None, None]
+            flags = flags | _at(table, "FLAG_ROW", numbers).astype(bool)[:, None, None]
         flag = frame.spread(flags, True)
         weight = frame.spread(self._weight(table, numbers), 0.0)
         if turned.any():
@@ -207,7 +224,7 @@ class MeasurementSet(VisibilitySet):
         ours = at.uvw_m
         stations = stations_seen(own, seen, rows.antenna1, rows.antenna2, ours)
         if stations is not None:
-            return Sampling(**{**_fields(at), "own_uvw_m": stations}), None
+            return replace(at, own_uvw_m=stations), None
         own = np.where(seen[..., None], own, ours[:, rows.antenna1] - ours[:, rows.antenna2])
         return at, own
 
@@ -242,10 +259,6 @@ class MeasurementSet(VisibilitySet):
             data = whole
         values = frame.correlated(data)
         _into(table, name, numbers, values[:, ::-1] if frame.backwards else values)
-
-
-def _fields(at: Sampling) -> dict[str, Any]:
-    return {name: getattr(at, name) for name in at.__dataclass_fields__}
 
 
 def _in_parts(table: Any, names: tuple[str, ...]) -> list[Any]:
@@ -305,12 +318,15 @@ def _into(table: Any, name: str, numbers: Int, values: Complex) -> None:
 
 
 def _add(table: Any, name: str, like: str) -> None:
-    """A new column of the shape of another."""
+    """A new column of the shape of another, zero."""
     described = dict(table.getcoldesc(like))
     described.update({"dataManagerGroup": f"Tiled{name}", "comment": "visibilities", "keywords": {}})
     described["dataManagerType"] = "TiledShapeStMan" if "shape" not in described else "TiledColumnStMan"
     with told(f"column {name}"):
         table.addcols({name: described}, {})
+        for r in range(0, table.nrow(), BLOCK_ROWS):  # or it holds what the disk held
+            rows = slice(r, min(r + BLOCK_ROWS, table.nrow()))
+            table.putcol(name, np.zeros_like(column(table, like, rows)), (rows,))
 
 
 def _short(values: Any) -> Any:

@@ -70,7 +70,7 @@ class Frame:
 
 
 def frame_of(path: str, window: int | None, field: int | None, described: Int, fields: Int) -> Frame:
-    """The frame of one window and field; those that rows have are `described` and `fields`, from which one is chosen."""
+    """The frame of one window and field, of those that rows have (`described`, `fields`)."""
     with opened(path, "DATA_DESCRIPTION") as table:
         windows, kinds = column(table, "SPECTRAL_WINDOW_ID"), column(table, "POLARIZATION_ID")
     if described.size and described.max() >= len(windows):
@@ -94,7 +94,7 @@ def _one(path: str, asked: int | None, have: list[int], name: str, what: str) ->
     if asked is None and len(have) == 1:
         return have[0]
     if asked in have:
-        return int(asked)  # type: ignore[arg-type]
+        return int(asked)
     known = ", ".join(map(str, have)) or "none"
     if asked is None:
         raise InputError(f"{path} holds {len(have)} {what} ({known}): choose one, {name}={have[0] if have else 0}")

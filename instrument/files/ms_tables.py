@@ -53,7 +53,9 @@ def told(what: str) -> Iterator[None]:
 def column(table: Any, name: str, rows: slice | None = None) -> Any:
     """Values of a column, (rows, ...), as an array of its own."""
     with told(f"column {name}"):
-        return np.array(table.getcol(name) if rows is None else table.getcol(name, (rows,)))
+        if rows is None:
+            return np.array(table.getcol(name))
+        return np.array(table.getcol(name, (slice(rows.start, min(rows.stop, table.nrow())),)))
 
 
 def demand(table: Any, names: tuple[str, ...], what: str) -> None:
