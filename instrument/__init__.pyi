@@ -31,6 +31,7 @@ from .errors import Outcome as Outcome
 from .experiments.incomplete_model import IncompleteModel as IncompleteModel
 from .files.fits import read_cube as read_cube
 from .files.fits_psf import read_psf as read_psf
+from .files.measurement_set import MeasurementSet as MeasurementSet
 from .files.number_list import read_frequencies as read_frequencies
 from .files.solutions import read_h5parm as read_h5parm
 from .files.solutions import write_h5parm as write_h5parm
@@ -70,6 +71,7 @@ from .model import Instrument as Instrument
 from .observe.grid import ImageGrid as ImageGrid
 from .observe.layout import Layout as Layout
 from .observe.observation import Observation as Observation
+from .observe.recorded import Recorded as Recorded
 from .observe.sampling import Sampling as Sampling
 from .pipeline.stage import Stage as Stage
 from .pipeline.stage import StageResult as StageResult

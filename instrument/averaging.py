@@ -88,6 +88,8 @@ def _at(vis: Any, rows: Int, columns: Int) -> Sampling:
         if (given := getattr(at, name)) is not None:
             found = _between(given, at.slots_s, slots)
             moved[name] = found / np.linalg.norm(found, axis=-1, keepdims=True)
+    if at.own_uvw_m is not None:
+        moved["own_uvw_m"] = _between(at.own_uvw_m, at.slots_s, slots)
     return replace(at, earth=earth, slots_s=slots, freq_hz=_centres(at.freq_hz, widths, columns), **moved)
 
 

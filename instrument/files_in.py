@@ -45,8 +45,8 @@ def open_regular(path: Any, limit_bytes: int | None = None, what: str = "file") 
     shown = harmless(path)
     if is_measurement_set(path):
         raise FileError(
-            f"'{shown}' is a Measurement Set, which is not read yet: image it with WSClean or CASA and give the FITS "
-            "images to 'instrument analyze', or describe the observation in a scene file for 'instrument run'"
+            f"'{shown}' is a Measurement Set: instrument.MeasurementSet reads it in Python; images of it, as FITS, "
+            "go into 'instrument analyze', an observation like it into a scene file for 'instrument run'"
         )
     try:
         # O_NONBLOCK and O_NOCTTY are not everywhere; O_BINARY is on Windows alone

@@ -135,7 +135,7 @@ def _as_given(instrument: Instrument, sky: Sky, observation: Observation) -> Pro
     afford(
         300.0 * channels * len(ra), f"a sky of {len(ra)} directions in {channels} channels", "ask for fewer of either"
     )
-    at = Sampling.build(layout, observation.times(layout), observation.freq_hz, ra, dec, observation.phase_centre)
+    at = observation.sampling(layout, ra, dec)
     _must_rise(at)
     _say_coincident(layout)
     a, b = layout.baselines

@@ -30,6 +30,8 @@ def recentred(vis: Any, centre: Direction) -> dict[str, Any]:
     uvw = baseline @ _axes(centre).T
     pointing = vis.at.pointing
     at = replace(vis.at, centre=centre, steered=None if pointing == centre else pointing)
+    if at.own_uvw_m is not None:
+        at = replace(at, own_uvw_m=at.own_uvw_m @ _axes(old) @ _axes(centre).T)
     stations = at.uvw_m
     own = stations[:, vis.antenna1] - stations[:, vis.antenna2]
     given = None if np.abs(uvw - own).max(initial=0.0) < SAME_M else uvw

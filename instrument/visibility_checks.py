@@ -23,8 +23,13 @@ def same_coordinates(one: Any, other: Any) -> bool:
         and np.array_equal(one.antenna2, other.antenna2)
         and np.array_equal(one.at.slots_s, other.at.slots_s)
         and np.array_equal(one.freq_hz, other.freq_hz)
-        and (one.given_uvw_m is other.given_uvw_m or np.array_equal(one.uvw_m, other.uvw_m))
+        and (_own(one) == _own(other) == (None, None) or np.array_equal(one.uvw_m, other.uvw_m))
     )
+
+
+def _own(vis: Any) -> tuple[Any, Any]:
+    """UVW of baselines and of stations that are not worked out."""
+    return (None if vis.given_uvw_m is None else "given", None if vis.at.own_uvw_m is None else "own")
 
 
 def as_kind(given: Any, kind: type) -> Any:

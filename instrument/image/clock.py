@@ -33,6 +33,7 @@ class Clock:
         apart = (
             block.given_uvw_m is not None
             or at.seen_centre is not None
+            or at.own_uvw_m is not None
             or at.layout.names != first.layout.names
             or not np.array_equal(at.layout.positions_m, first.layout.positions_m)
             or not all(map(np.array_equal, self.antennas, (block.antenna1, block.antenna2)))

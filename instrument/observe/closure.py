@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from instrument.errors import InputError
-from instrument.units import Float, Int
+from instrument.units import Bool, Float, Int
 
 CLOSURE_M = 1e-6  # 3e-6 rad of phase at 150 MHz
 
@@ -28,3 +28,26 @@ def stations_of(uvw_m: Float, antenna1: Int, antenna2: Int, count: int) -> Float
             "station needs baselines of the same times"
         )
     return np.asarray(found)
+
+
+def stations_seen(uvw_m: Float, seen: Bool, antenna1: Int, antenna2: Int, ours_m: Float) -> Float | None:
+    """Stations (T, A, 3), m, of baselines (T, B, 3) of which some were not seen (T, B); `None` where they do not close.
+
+    What no baseline tells, where a group of stations stands as a whole, is nearest to `ours_m` (T, A, 3).
+    """
+    count, one, two = ours_m.shape[1], antenna1, antenna2
+    found = ours_m.copy()
+    kinds, of = np.unique(seen, axis=0, return_inverse=True)
+    for k, there in enumerate(kinds):
+        times = np.flatnonzero(of.ravel() == k)
+        a, b = one[there], two[there]
+        matrix = np.zeros((len(a), count))
+        matrix[np.arange(len(a)), a], matrix[np.arange(len(a)), b] = 1.0, -1.0
+        rest = uvw_m[times][:, there] - (ours_m[times][:, a] - ours_m[times][:, b])
+        right = matrix.T @ rest.transpose(1, 0, 2).reshape(len(a), -1)
+        moved = np.linalg.pinv(matrix.T @ matrix, hermitian=True) @ right
+        found[times] += moved.reshape(count, len(times), 3).transpose(1, 0, 2)
+        apart = np.abs(found[times][:, a] - found[times][:, b] - uvw_m[times][:, there])
+        if apart.max(initial=0.0) > CLOSURE_M:
+            return None
+    return found

@@ -14,6 +14,7 @@ from instrument.memory import afford
 from instrument.observe.clock import later
 from instrument.observe.directions import transit_time
 from instrument.observe.layout import Layout
+from instrument.observe.sampling import Sampling
 from instrument.units import Float, Hertz, HertzArray, Instant, Seconds, SkyDirection
 
 MOST_TIMES = 3_000_000  # integrations that are planned at once, at 20 us and 1 kB each
@@ -105,3 +106,7 @@ class Observation(Component):
         else:
             begin = self.start
         return later(begin, (np.arange(self.count) + 0.5) * self.interval * u.s)
+
+    def sampling(self, layout: Layout, ra_rad: Float, dec_rad: Float) -> Sampling:
+        """The `Sampling` of its times and channels for directions (S,), ICRS rad."""
+        return Sampling.build(layout, self.times(layout), self.freq_hz, ra_rad, dec_rad, self.phase_centre)

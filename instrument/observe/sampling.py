@@ -35,7 +35,8 @@ class Sampling:
     Everything geometric is worked out when asked for, once. `seen`, `seen_east` (T, S, 3) and `seen_centre` (T, 3)
     override the ITRF directions, the east vectors across them and the phase centre, for work with another program's
     frames; `towards` drops the first two, which belong to the directions. Beams point at `steered`, the phase centre
-    unless given: it stays where data are turned to another phase centre.
+    unless given: it stays where data are turned to another phase centre. `own_uvw_m` (T, A, 3) are the station
+    coordinates of a file, which every fringe then has: another program's Earth differs by 0.5 arcsec.
     """
 
     __repr__ = short_repr
@@ -50,6 +51,7 @@ class Sampling:
     seen_east: Float | None = None
     seen_centre: Float | None = None
     steered: Direction | None = None
+    own_uvw_m: Float | None = None
 
     @classmethod
     @checked
@@ -105,7 +107,20 @@ class Sampling:
         late = float(np.arctan2(there[0, 1], there[0, 0])) / EARTH_RATE
         times = start + (which * interval_s + late) * u.s
         earth, slots = earth_frame(times, self.layout.centre_m), self.slots_s[0] + which * interval_s
-        return replace(self, earth=earth, slots_s=slots, seen=None, seen_east=None, seen_centre=None)
+        made = replace(self, earth=earth, slots_s=slots, seen=None, seen_east=None, seen_centre=None, own_uvw_m=None)
+        return made if self.own_uvw_m is None else replace(made, own_uvw_m=self._turned(made))
+
+    def _turned(self, made: Sampling) -> Float:
+        """Own UVW at other times: ours, turned as those of the file are at its nearest time.
+
+        What a rotation leaves of them, nothing where the file has the stations where they are, is taken from there too.
+        """
+        own, ours = self.own_uvw_m, replace(self, own_uvw_m=None).uvw_m
+        assert own is not None
+        near = np.abs(made.slots_s[:, None] - self.slots_s).argmin(axis=1)
+        turn = _rotations(ours, own)
+        rest = own - ours @ np.swapaxes(turn, 1, 2)
+        return np.asarray(made.uvw_m @ np.swapaxes(turn, 1, 2)[near] + rest[near])
 
     def regular(self, interval_s: float) -> bool:
         """Whether its times follow each other every `interval_s`, to 10 ns, and are seen from where they are."""
@@ -123,6 +138,7 @@ class Sampling:
             seen=None if self.seen is None else self.seen[times],
             seen_east=None if self.seen_east is None else self.seen_east[times],
             seen_centre=None if self.seen_centre is None else self.seen_centre[times],
+            own_uvw_m=None if self.own_uvw_m is None else self.own_uvw_m[times],
         )
 
     @checked
@@ -137,7 +153,7 @@ class Sampling:
     def one_per_frame(self) -> Sampling:
         """The same for one station of each distinct set of axes (`layout.frames`)."""
         few = self.layout.one_per_frame
-        return self if few is self.layout else replace(self, layout=few)
+        return self if few is self.layout else replace(self, layout=few, own_uvw_m=None)
 
     @cached_property
     def vectors(self) -> Float:
@@ -241,8 +257,22 @@ class Sampling:
     @cached_property
     def uvw_m(self) -> Float:
         """Station coordinates u, v, w in m about the array's centre (T, A, 3); u_ab = u_a - u_b."""
+        if self.own_uvw_m is not None:
+            return self.own_uvw_m
         relative = self.layout.positions_m - self.layout.centre_m
         return relative[None] @ np.swapaxes(self.earth.uvw_axes(self.centre), 1, 2)
+
+
+def _rotations(ours: Float, theirs: Float) -> Float:
+    """Least rotations (T, 3, 3), small ones, that bring stations (T, A, 3) near to others, about their means."""
+    a, b = (x - x.mean(axis=1, keepdims=True) for x in (ours, theirs))
+    normal = (a**2).sum(axis=(1, 2))[:, None, None] * np.eye(3) - np.swapaxes(a, 1, 2) @ a
+    # what no station tells, about the line of two of them, is left as it is
+    vector = (np.linalg.pinv(normal, rcond=1e-9, hermitian=True) @ np.cross(a, b).sum(axis=1)[..., None])[..., 0]
+    axes = np.broadcast_to(np.eye(3), (len(a), 3, 3))
+    turned = axes + np.cross(vector[:, None], axes)  # rows: the images of the unit vectors, to first order
+    left, _, right = np.linalg.svd(turned)
+    return np.swapaxes(left @ right, 1, 2)
 
 
 def times_of(slots_s: Float) -> Any:

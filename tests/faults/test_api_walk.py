@@ -179,6 +179,7 @@ def calls():
         ("Visibilities.open", ins.Visibilities.open, {
             "path": "none.h5", "times": slice(0, 1), "channels": slice(0, 1)}),
         ("VisibilityFile", ins.VisibilityFile, {"path": "none.h5"}),
+        ("MeasurementSet", ins.MeasurementSet, {"path": "none.MS", "column": "DATA", "window": 0, "field": 0}),
         ("Visibilities.without_beam", w.vis.without_beam, {"instrument": w.instrument}),
         ("JonesTable.jones", w.solution.term.jones, {"at": w.at}),
         ("SelfCal.solve", ins.SelfCal().solve, {"data": w.vis, "model": w.vis}),

@@ -117,7 +117,7 @@ def test_g3_a_measurement_set_is_named_and_what_to_do(here, capsys, words):
         (here / name / "table.dat").write_bytes(b"\xbe\xbe\xbe\xbe")
     status, _, said = said_by(capsys, *words)
     assert status == 2 and said.count("\n") == 1
-    assert "is a Measurement Set, which is not read yet: image it with WSClean or CASA" in said
+    assert "is a Measurement Set: instrument.MeasurementSet reads it in Python" in said
 
 
 # G8: leakage that is none -------------------------------------------------------------------------------------------

@@ -1,0 +1,335 @@
+"""MeasurementSet: a Measurement Set as a set of visibilities, in blocks; its own UVW; columns read and written."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from instrument.checked import checked
+from instrument.errors import FileError, InputError, warn
+from instrument.files.ms_frame import Frame, beam_state_of, frame_of
+from instrument.files.ms_tables import column, demand, opened, told
+from instrument.observe.closure import stations_seen
+from instrument.observe.directions import earth_frame
+from instrument.observe.recorded import Recorded
+from instrument.observe.sampling import Sampling, times_of
+from instrument.store import Store
+from instrument.units import Bool, Complex, Float, Int
+from instrument.visibilities import Visibilities, VisibilitySet
+from instrument.visibility_sets import BLOCK_BYTES, VisibilityFile, as_set
+
+AT_ONCE = 1_000_000  # rows of what tells where the rows are
+BLOCK_ROWS = 10_000  # of a new column that are written at once
+SAME_S = 1e-3  # times as near as this are one
+NEEDED = ("TIME", "INTERVAL", "ANTENNA1", "ANTENNA2", "DATA_DESC_ID", "FIELD_ID", "UVW", "FLAG")
+
+
+class Rows(NamedTuple):
+    """Where the rows of one window and field are: their numbers, in order of time, and the times of these."""
+
+    numbers: Int  # (N,)
+    begins: Int  # (T + 1,) of `numbers`
+    slots_s: Float  # (T,)
+    interval_s: Float  # (T,)
+    antenna1: Int  # (B,) of all baselines, antenna1 < antenna2
+    antenna2: Int
+    autos: int  # rows left out
+
+
+@checked
+class MeasurementSet(VisibilitySet):
+    """One window and field of a Measurement Set: its column `column` in blocks of at most 64 MB of data.
+
+    Rows may stand in any order, times may be irregular and baselines missing (they are flagged); autocorrelations are
+    left out, with a warning. Weights are WEIGHT_SPECTRUM, or WEIGHT; flags FLAG or FLAG_ROW. The UVW of the file are
+    used, antenna 2 minus antenna 1: those of its stations (`Sampling.own_uvw_m`), or those of its baselines where they
+    do not close (`given_uvw_m`). Circular feeds come as linear ones: V = C^H V_RL C with R = (X + iY) / sqrt(2) of
+    coherencies, RR = I + V. Raises `FileError` for what is no whole set, `InputError` where a window or field is to be
+    chosen. Source of the format: Kemball & Wieringa (2000), MeasurementSet definition version 2.0.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], column: str = "DATA", window: int | None = None, field: int | None = None
+    ) -> None:
+        self.path, self.column = str(path), column
+        with opened(self.path) as table:
+            demand(table, NEEDED, self.path)
+            self._known(table)
+            if not table.nrow():
+                raise FileError(f"{self.path} has no rows")
+            described, fields = (np.unique(values) for values in _in_parts(table, ("DATA_DESC_ID", "FIELD_ID")))
+            self.frame = frame_of(self.path, window, field, described, fields)
+            self.rows = _rows(table, self.frame, self.path)
+            self.weights = next((n for n in ("WEIGHT_SPECTRUM", "WEIGHT") if _filled(table, n, self.rows)), "")
+            self.beam_state = beam_state_of(table.getcolkeywords(column), self.path)
+        if self.rows.autos:
+            warn(f"{self.path}: {self.rows.autos} rows are autocorrelations: left out")
+
+    def __repr__(self) -> str:
+        times, channels, baselines = self.shape
+        return (
+            f"MeasurementSet({self.path}, {self.column}: {self.frame.telescope}, {times} times, {channels} channels, "
+            f"{baselines} baselines, {len(self.frame.layout)} stations, {self.beam_state})"
+        )
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Times, channels, baselines."""
+        return len(self.rows.slots_s), len(self.frame.freq_hz), len(self.rows.antenna1)
+
+    @property
+    def freq_hz(self) -> Float:
+        """Channel centres, Hz (F,), ascending."""
+        return self.frame.freq_hz
+
+    def observation(self) -> Recorded:
+        """The observation that the set holds, for a `Scene` that is predicted with its times, channels and UVW.
+
+        Raises `InputError` where the UVW are not those of stations, or integrations are not equally long.
+        """
+        rows, parts = self.rows, [block.at for block in self.blocks()]
+        if any(at.own_uvw_m is None for at in parts):
+            raise InputError(f"{self.path}: its UVW do not close around triangles of stations: nothing is predicted")
+        if np.ptp(rows.interval_s) > SAME_S:
+            raise InputError(f"{self.path}: integrations of {rows.interval_s.min():g} to {rows.interval_s.max():g} s")
+        at = replace(parts[0].at_centre(), slots_s=rows.slots_s, own_uvw_m=np.concatenate([p.uvw_m for p in parts]))
+        width = self.frame.width_hz
+        return Recorded.of(at, float(rows.interval_s[0]), float(width[0]) if np.ptp(width) == 0 else None)
+
+    def blocks(self) -> Iterator[Visibilities]:
+        """Blocks in order of time, all channels each."""
+        times, channels, baselines = self.shape
+        step = int(max(1, BLOCK_BYTES // (64 * baselines * channels)))
+        with opened(self.path) as table:
+            for t in range(0, times, step):
+                yield self._block(table, slice(t, min(t + step, times)))
+
+    @checked
+    def write(self, column: str, blocks: VisibilitySet | Iterable[Visibilities], overwrite: bool = False) -> None:
+        """Write visibilities of the same times, channels and stations into a column, which is made if it is not there.
+
+        The blocks are worked out and kept beside the set first: where that fails, the set is as it was. A column that
+        is there is written with `overwrite` only. Rows that no block has, of autocorrelations and of other windows and
+        fields, stay as they are, zero in a new column. Raises `InputError` for blocks that are of something else.
+        """
+        with opened(self.path) as table:
+            if column in table.columns() and not overwrite:
+                raise InputError(f"{self.path} has a column {column}: name another one, or allow to overwrite it")
+        if column in NEEDED or column in ("TIME_CENTROID", "EXPOSURE", "WEIGHT", "SIGMA", "WEIGHT_SPECTRUM"):
+            raise InputError(f"{column} is no column for visibilities")
+        place = Path(self.path).absolute().parent
+        with tempfile.TemporaryDirectory(dir=place, prefix=f".{Path(self.path).name}.") as folder:
+            kept = Path(folder) / "blocks.h5"
+            as_set(blocks).save(kept)
+            self._same(Store(kept))
+            with opened(self.path, writable=True) as table:
+                if column not in table.columns():
+                    _add(table, column, self.column)
+                for block in VisibilityFile(kept).blocks():
+                    self._put(table, column, block)
+
+    def _known(self, table: Any) -> None:
+        if self.column not in table.columns():
+            cubes = [n for n in table.columns() if "omplex" in str(table.getcoldesc(n).get("valueType", "")).lower()
+                     or "COMPLEX" in str(table.getcoldesc(n).get("valueType", ""))]  # fmt: skip
+            raise InputError(f"{self.path} has no column {self.column}: it has {', '.join(cubes) or 'no visibilities'}")
+        kind = str(table.getcoldesc(self.column).get("valueType", "")).lower()
+        if "complex" not in kind:
+            raise InputError(f"{self.path}: column {self.column} holds {kind}, not visibilities")
+
+    def _there(self, times: slice, one: Int, two: Int) -> Int:
+        """Where each row of some times stands among the baselines; raises `FileError` for a baseline that is twice."""
+        rows, stations = self.rows, len(self.frame.layout)
+        low, high = np.minimum(one, two), np.maximum(one, two)
+        names = rows.antenna1 * stations + rows.antenna2
+        found = np.searchsorted(names, low * stations + high)
+        slot = np.repeat(np.arange(times.stop - times.start), np.diff(rows.begins[times.start : times.stop + 1]))
+        place = slot * len(names) + found
+        if len(np.unique(place)) < len(place):
+            twice = int(slot[np.flatnonzero(np.diff(np.sort(place)) == 0)[0]]) if len(place) else 0
+            raise FileError(
+                f"{self.path}: a baseline has two rows at time {times.start + twice} of this window and field"
+            )
+        return np.asarray(place)
+
+    def _block(self, table: Any, times: slice) -> Visibilities:
+        rows, frame = self.rows, self.frame
+        numbers = rows.numbers[rows.begins[times.start] : rows.begins[times.stop]]
+        one, two, uvw = (_at(table, name, numbers) for name in ("ANTENNA1", "ANTENNA2", "UVW"))
+        place = self._there(times, one, two)
+        turned = one > two
+        shape = (times.stop - times.start, len(rows.antenna1))
+
+        def grid(values: Any, lacking: Any) -> Any:
+            out = np.full((shape[0] * shape[1], *values.shape[1:]), lacking, values.dtype)
+            out[place] = values
+            return out.reshape(*shape, *values.shape[1:])
+
+        data = frame.linear(self._cube(table, self.column, numbers))
+        flags = self._cube(table, "FLAG", numbers).astype(bool)
+        if "FLAG_ROW" in table.columns():
+            flags = flags | _at(table, "FLAG_ROW", numbers).astype(bool)[:, None, None]
+        flag = frame.spread(flags, True)
+        weight = frame.spread(self._weight(table, numbers), 0.0)
+        if turned.any():
+            swap = (slice(None), slice(None), slice(None), slice(None))
+            data[turned] = np.conj(np.swapaxes(data[turned], -1, -2))
+            flag, weight = (np.array(x[swap]) for x in (flag, weight))
+            for x in (flag, weight):
+                x[turned] = np.swapaxes(x[turned], -1, -2)
+        seen = grid(np.ones(len(numbers), bool), False)
+        own = grid(np.where(turned[:, None], uvw, -uvw), np.nan)  # station 1 minus station 2
+        flag, weight = (_short(np.moveaxis(grid(x, lack), 1, 2)) for x, lack in ((flag, True), (weight, 0.0)))
+        at, given = self._at(times, own, seen)
+        return Visibilities(
+            data=np.moveaxis(grid(data, 0.0), 1, 2), at=at, antenna1=rows.antenna1, antenna2=rows.antenna2,
+            interval_s=rows.interval_s[times], width_hz=frame.width_hz, weight=weight, flag=flag,
+            beam_state=self.beam_state, given_uvw_m=given,
+        )  # fmt: skip
+
+    def _cube(self, table: Any, name: str, numbers: Int) -> Any:
+        """Values (N, F, n) of a column, channels ascending."""
+        values = _at(table, name, numbers)
+        want = (len(numbers), len(self.frame.freq_hz), len(self.frame.kinds))
+        if values.shape != want:
+            raise FileError(f"{self.path}: {name} has shape {values.shape}, channels and correlations need {want}")
+        return values[:, ::-1] if self.frame.backwards else values
+
+    def _weight(self, table: Any, numbers: Int) -> Float:
+        shape = (len(numbers), len(self.frame.freq_hz), len(self.frame.kinds))
+        if self.weights == "WEIGHT_SPECTRUM":
+            values = self._cube(table, self.weights, numbers)
+        elif self.weights == "WEIGHT":
+            values = np.broadcast_to(_at(table, "WEIGHT", numbers)[:, None], shape)
+        else:
+            return np.ones(shape)
+        values = np.asarray(values, float)
+        return np.where(np.isfinite(values) & (values > 0), values, 0.0)
+
+    def _at(self, times: slice, own: Float, seen: Bool) -> tuple[Sampling, Float | None]:
+        """Coordinates, with the UVW of stations or, where these do not close, of baselines (T, B, 3)."""
+        rows, frame = self.rows, self.frame
+        slots, centre = rows.slots_s[times], frame.centre
+        at = Sampling(
+            frame.layout, earth_frame(times_of(slots), frame.layout.centre_m), slots, frame.freq_hz,
+            np.array([centre.ra_rad]), np.array([centre.dec_rad]), centre,
+            steered=None if frame.pointing == centre else frame.pointing,
+        )  # fmt: skip
+        ours = at.uvw_m
+        stations = stations_seen(own, seen, rows.antenna1, rows.antenna2, ours)
+        if stations is not None:
+            return replace(at, own_uvw_m=stations), None
+        own = np.where(seen[..., None], own, ours[:, rows.antenna1] - ours[:, rows.antenna2])
+        return at, own
+
+    def _same(self, kept: Store) -> None:
+        """Raise `InputError` unless what was kept is of these times, channels and baselines."""
+        rows, small = self.rows, kept.small
+        if kept.layout.names != self.frame.layout.names:
+            raise InputError(f"the visibilities are of other stations than {self.path}")
+        for name in ("antenna1", "antenna2"):
+            if not np.array_equal(small[name], getattr(rows, name)):
+                raise InputError(f"the visibilities are of other baselines than {self.path}")
+        if kept.shape[0] != self.shape[0] or np.abs(kept.slots_s - rows.slots_s).max() > SAME_S:
+            raise InputError(f"the visibilities are of other times than {self.path}")
+        if kept.shape[1] != self.shape[1] or np.abs(kept.freq_hz - self.freq_hz).max() > 1.0:
+            raise InputError(f"the visibilities are of other channels than {self.path}")
+
+    def _put(self, table: Any, name: str, block: Visibilities) -> None:
+        """Write a block, where its times and channels are."""
+        rows, frame = self.rows, self.frame
+        first = int(np.abs(rows.slots_s - block.at.slots_s[0]).argmin())
+        times = slice(first, first + len(block.at.slots_s))
+        numbers = rows.numbers[rows.begins[times.start] : rows.begins[times.stop]]
+        one, two = (_at(table, column_, numbers) for column_ in ("ANTENNA1", "ANTENNA2"))
+        place = self._there(times, one, two)
+        data = np.moveaxis(block.data, 1, 2).reshape(-1, len(block.freq_hz), 2, 2)[place]
+        turned = one > two
+        data[turned] = np.conj(np.swapaxes(data[turned], -1, -2))
+        channels = np.searchsorted(frame.freq_hz, block.freq_hz - 1.0)
+        if len(channels) < len(frame.freq_hz):
+            whole = frame.linear(self._cube(table, name, numbers))
+            whole[:, channels] = data
+            data = whole
+        values = frame.correlated(data)
+        _into(table, name, numbers, values[:, ::-1] if frame.backwards else values)
+
+
+def _in_parts(table: Any, names: tuple[str, ...]) -> list[Any]:
+    """Columns of numbers, whole, read in parts."""
+    found: list[Any] = []
+    for name in names:
+        parts = [column(table, name, slice(r, r + AT_ONCE)) for r in range(0, table.nrow(), AT_ONCE)]
+        found.append(np.concatenate(parts))
+    return found
+
+
+def _filled(table: Any, name: str, rows: Rows) -> bool:
+    """Whether a column of weights is there and has values."""
+    if name not in table.columns():
+        return False
+    try:
+        return column(table, name, slice(int(rows.numbers[0]), int(rows.numbers[0]) + 1)).size > 0
+    except FileError:
+        return False  # declared, and empty
+
+
+def _rows(table: Any, frame: Frame, path: str) -> Rows:
+    """The rows of the window and field of a frame."""
+    described, fields, time, one, two = _in_parts(table, ("DATA_DESC_ID", "FIELD_ID", "TIME", "ANTENNA1", "ANTENNA2"))
+    mine = (described == frame.described) & (fields == frame.field)
+    autos = int((mine & (one == two)).sum())
+    numbers = np.flatnonzero(mine & (one != two))
+    if not len(numbers):
+        raise FileError(f"{path} has no cross-correlations of this window and field")
+    time, one, two = (x[numbers] for x in (time, one, two))
+    if not np.isfinite(time).all():
+        raise FileError(f"{path}: TIME is not finite")
+    stations = len(frame.layout)
+    if min(one.min(), two.min()) < 0 or max(one.max(), two.max()) >= stations:
+        raise FileError(f"{path}: rows are of station {max(one.max(), two.max())}, of {stations} that are described")
+    if np.any(np.diff(time) < 0):
+        order = np.argsort(time, kind="stable")
+        numbers, time, one, two = (x[order] for x in (numbers, time, one, two))
+    begins = np.append(np.flatnonzero(np.diff(time, prepend=-np.inf) > SAME_S), len(time))
+    pairs = np.unique(np.minimum(one, two).astype(np.int64) * stations + np.maximum(one, two))
+    interval = _at(table, "INTERVAL", numbers[begins[:-1]])
+    return Rows(numbers, begins, time[begins[:-1]], interval, pairs // stations, pairs % stations, autos)
+
+
+def _at(table: Any, name: str, numbers: Int) -> Any:
+    """Values of a column at some rows: those that follow each other in one go."""
+    if len(numbers) and numbers[-1] - numbers[0] + 1 == len(numbers) and np.all(np.diff(numbers) == 1):
+        return column(table, name, slice(int(numbers[0]), int(numbers[-1]) + 1))
+    with told(f"column {name}"):
+        return np.array(table.getcol(name, (np.asarray(numbers),)))
+
+
+def _into(table: Any, name: str, numbers: Int, values: Complex) -> None:
+    kind = np.complex128 if "d" in str(table.getcoldesc(name)["valueType"]).lower()[:1] else np.complex64
+    with told(f"column {name}"):
+        table.putcol(name, np.ascontiguousarray(values, kind), (np.asarray(numbers),))
+
+
+def _add(table: Any, name: str, like: str) -> None:
+    """A new column of the shape of another, zero."""
+    described = dict(table.getcoldesc(like))
+    described.update({"dataManagerGroup": f"Tiled{name}", "comment": "visibilities", "keywords": {}})
+    described["dataManagerType"] = "TiledShapeStMan" if "shape" not in described else "TiledColumnStMan"
+    with told(f"column {name}"):
+        table.addcols({name: described}, {})
+        for r in range(0, table.nrow(), BLOCK_ROWS):  # or it holds what the disk held
+            rows = slice(r, min(r + BLOCK_ROWS, table.nrow()))
+            table.putcol(name, np.zeros_like(column(table, like, rows)), (rows,))
+
+
+def _short(values: Any) -> Any:
+    """Values of correlations (T, F, B, 2, 2) as (T, F, B) where all four are alike."""
+    first = values[..., 0, 0]
+    return first.copy() if np.all(values == first[..., None, None]) else values

@@ -1,0 +1,65 @@
+"""Tables of a Measurement Set through arcae: opened, read and written in rows, every failure one line of ours."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from instrument.errors import FileError, InputError
+from instrument.files_in import harmless
+
+MISSING = "Measurement Sets need arcae (Linux, macOS): pip install 'instrument[ms]'"
+
+
+@contextmanager
+def opened(path: str | os.PathLike[str], sub: str = "", writable: bool = False) -> Iterator[Any]:
+    """A table of the set, closed at the end; `FileError` for what is none, is locked, or cannot be read here."""
+    try:
+        from arcae.lib.arrow_tables import Table
+    except ImportError:
+        raise InputError(MISSING) from None
+    name = str(path)
+    if not Path(name).exists():
+        raise FileError(f"{name}: there is no such Measurement Set")
+    if not (Path(name) / "table.dat").is_file():
+        raise FileError(f"{name}: no Measurement Set: it is to be a folder with a file table.dat")
+    with told(f"{name}::{sub}" if sub else name):
+        table = Table.from_filename(f"{name}::{sub}" if sub else name, readonly=not writable)
+    try:
+        yield table
+    finally:
+        table.close()
+
+
+@contextmanager
+def told(what: str) -> Iterator[None]:
+    """Failures of the library as `FileError`s about `what`; a storage manager that is not there by its name."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (ValueError, RuntimeError, KeyError, TypeError, OSError, NotImplementedError) as error:
+        text = " ".join(str(error).split())
+        if "Data Manager class" in text or "datamanager" in text.lower():
+            text += " (a storage manager that is not installed here: write the set without compression, DP3's msout)"
+        raise FileError(f"{harmless(what)}: {harmless(text, 300)}") from None
+
+
+def column(table: Any, name: str, rows: slice | None = None) -> Any:
+    """Values of a column, (rows, ...), as an array of its own."""
+    with told(f"column {name}"):
+        if rows is None:
+            return np.array(table.getcol(name))
+        return np.array(table.getcol(name, (slice(rows.start, min(rows.stop, table.nrow())),)))
+
+
+def demand(table: Any, names: tuple[str, ...], what: str) -> None:
+    """`FileError` for columns that a table lacks."""
+    lacking = [name for name in names if name not in table.columns()]
+    if lacking:
+        raise FileError(f"{what} has no column {', '.join(lacking)}: it is no whole Measurement Set")
