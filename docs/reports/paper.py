@@ -152,20 +152,25 @@ def figures(runs):
 def again(full, other):
     """Numbers of two runs of the full form that are not the same."""
     one, two = record(full), record(other)
-    rows = []
+    rows, alone = [], []
     for name, numbers in one["numbers"].items():
         for what, value in numbers.items():
+            if what not in two["numbers"].get(name, {}):
+                alone.append(f"{name}: {what}")
+                continue
             beside = two["numbers"][name][what]
             if beside != value:  # None, which is NaN, is itself
                 share = abs(beside - value) / max(abs(value), 1e-300)
                 rows.append(f"| {name} | {what} | {number(value, 6)} | {number(beside, 6)} | {share:.1e} |")
-    every = sum(len(numbers) for numbers in one["numbers"].values())
+    every = sum(len(numbers) for numbers in one["numbers"].values()) - len(alone)
     text = (
         f"# Two runs of the full form\n\n`instrument paper`, {one['finished'][:16]} and {two['finished'][:16]}; "
         f"{sum(one['seconds'].values()) / 60:.0f} and {sum(two['seconds'].values()) / 60:.0f} minutes, "
         f"{max(one['memory'].values()) / 1e9:.2f} and {max(two['memory'].values()) / 1e9:.2f} GB.\n\n"
         f"{every - len(rows)} of {every} numbers are the same to the last bit.\n"
     )
+    if alone:
+        text += f"\nOf the first run alone, whose program has them since: {'; '.join(alone)}.\n"
     if rows:
         text += "\n| | | first | second | differs by |\n|---|---|---|---|---|\n" + "\n".join(rows) + "\n"
     (HERE / "again.md").write_text(text)
