@@ -71,7 +71,6 @@ from .model import Instrument as Instrument
 from .observe.grid import ImageGrid as ImageGrid
 from .observe.layout import Layout as Layout
 from .observe.observation import Observation as Observation
-from .observe.recorded import Recorded as Recorded
 from .observe.sampling import Sampling as Sampling
 from .pipeline.stage import Stage as Stage
 from .pipeline.stage import StageResult as StageResult
