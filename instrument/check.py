@@ -276,8 +276,10 @@ def _same_scene(block: Visibilities, full: Problem) -> None:
         )
     if block.layout.names != full.at.layout.names or block.phase_centre != full.at.centre:
         raise InputError("these visibilities are of other stations or another phase centre than the plan")
-    if block.given_uvw_m is not None:
-        apart = float(np.abs(block.given_uvw_m - replace(block, given_uvw_m=None).uvw_m).max(initial=0.0))
+    ours = full.at.own_uvw_m is None  # else the plan has those of a file as well, and is held to them
+    if block.given_uvw_m is not None or (block.at.own_uvw_m is not None and ours):
+        at = replace(block.at, own_uvw_m=None) if ours else block.at
+        apart = float(np.abs(block.uvw_m - replace(block, given_uvw_m=None, at=at).uvw_m).max(initial=0.0))
         if apart > CLOSURE_M:
             raise InputError(
                 f"these visibilities have UVW of their own, up to {apart:.2g} m from those that a plan works out: "

@@ -33,15 +33,8 @@ WHAT = "file of visibilities"
 CHUNK_BYTES = 1e6  # of data that HDF5 reads at once
 # of times, by name: where it is found in visibilities, and its axes behind the times
 PER_TIME = (
-    "slots_s",
-    "earth_matrices",
-    "earth_velocity",
-    "seen",
-    "seen_east",
-    "seen_centre",
-    "given_uvw_m",
-    "own_uvw_m",
-)
+    "slots_s", "earth_matrices", "earth_velocity", "seen", "seen_east", "seen_centre", "given_uvw_m", "own_uvw_m",
+)  # fmt: skip
 SPREAD = {"weight": (0, 1), "flag": (0, 1), "interval_s": (0,), "width_hz": (1,)}  # axes along which one may do for all
 FIXED = ("antenna1", "antenna2", "ra_rad", "dec_rad", "centre", "layout", "beam_state")
 KINDS = {"data": "c", "flag": "b", "antenna1": "iu", "antenna2": "iu", "layout": "u", "beam_state": "u"}

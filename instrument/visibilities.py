@@ -102,6 +102,9 @@ class Visibilities(VisibilitySet):
         check_weights(self.weight, self.flag, want)
         if (uvw := self.given_uvw_m) is not None and (uvw.shape != (times, want[2], 3) or not np.isfinite(uvw).all()):
             raise InputError(f"given_uvw_m has shape {uvw.shape}, needed {(times, want[2], 3)}, all finite")
+        places = (times, len(self.layout), 3)
+        if (own := self.at.own_uvw_m) is not None and (own.shape != places or not np.isfinite(own).all()):
+            raise InputError(f"own_uvw_m has shape {own.shape}, needed {places}, all finite")
 
     def __repr__(self) -> str:
         times, channels, baselines = self.data.shape[:3]

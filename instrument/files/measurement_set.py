@@ -7,39 +7,27 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from instrument.checked import checked
 from instrument.errors import FileError, InputError, warn
-from instrument.files.ms_frame import Frame, beam_state_of, frame_of
-from instrument.files.ms_tables import column, demand, opened, told
+from instrument.files.ms_frame import beam_state_of, beam_words, frame_of
+from instrument.files.ms_rows import SAME_S, add_column, at_rows, filled, in_parts, put_rows, rows_of, short
+from instrument.files.ms_tables import demand, opened, told
 from instrument.observe.closure import stations_seen
 from instrument.observe.directions import earth_frame
 from instrument.observe.recorded import Recorded
 from instrument.observe.sampling import Sampling, times_of
 from instrument.store import Store
-from instrument.units import Bool, Complex, Float, Int
+from instrument.units import Bool, Float, Int
 from instrument.visibilities import Visibilities, VisibilitySet
 from instrument.visibility_sets import BLOCK_BYTES, VisibilityFile, as_set
 
-AT_ONCE = 1_000_000  # rows of what tells where the rows are
-BLOCK_ROWS = 10_000  # of a new column that are written at once
-SAME_S = 1e-3  # times as near as this are one
+SAME_RAD = 1e-9  # phase centres as near as this are one
+FAR = 0.01  # 0.6 deg: precession from J2000 to 2050 is 0.7
 NEEDED = ("TIME", "INTERVAL", "ANTENNA1", "ANTENNA2", "DATA_DESC_ID", "FIELD_ID", "UVW", "FLAG")
-
-
-class Rows(NamedTuple):
-    """Where the rows of one window and field are: their numbers, in order of time, and the times of these."""
-
-    numbers: Int  # (N,)
-    begins: Int  # (T + 1,) of `numbers`
-    slots_s: Float  # (T,)
-    interval_s: Float  # (T,)
-    antenna1: Int  # (B,) of all baselines, antenna1 < antenna2
-    antenna2: Int
-    autos: int  # rows left out
 
 
 @checked
@@ -63,10 +51,10 @@ class MeasurementSet(VisibilitySet):
             self._known(table)
             if not table.nrow():
                 raise FileError(f"{self.path} has no rows")
-            described, fields = (np.unique(values) for values in _in_parts(table, ("DATA_DESC_ID", "FIELD_ID")))
+            described, fields = (np.unique(values) for values in in_parts(table, ("DATA_DESC_ID", "FIELD_ID")))
             self.frame = frame_of(self.path, window, field, described, fields)
-            self.rows = _rows(table, self.frame, self.path)
-            self.weights = next((n for n in ("WEIGHT_SPECTRUM", "WEIGHT") if _filled(table, n, self.rows)), "")
+            self.rows = rows_of(table, self.frame, self.path)
+            self.weights = next((n for n in ("WEIGHT_SPECTRUM", "WEIGHT") if filled(table, n, self.rows)), "")
             self.beam_state = beam_state_of(table.getcolkeywords(column), self.path)
         if self.rows.autos:
             warn(f"{self.path}: {self.rows.autos} rows are autocorrelations: left out")
@@ -93,22 +81,27 @@ class MeasurementSet(VisibilitySet):
 
         Raises `InputError` where the UVW are not those of stations, or integrations are not equally long.
         """
-        rows, parts = self.rows, [block.at for block in self.blocks()]
-        if any(at.own_uvw_m is None for at in parts):
+        rows = self.rows
+        with opened(self.path) as table:
+            parts = [self._coordinates(table, times)[:2] for times in self._steps()]
+        if any(given is not None for _, given in parts):
             raise InputError(f"{self.path}: its UVW do not close around triangles of stations: nothing is predicted")
         if np.ptp(rows.interval_s) > SAME_S:
             raise InputError(f"{self.path}: integrations of {rows.interval_s.min():g} to {rows.interval_s.max():g} s")
-        at = replace(parts[0].at_centre(), slots_s=rows.slots_s, own_uvw_m=np.concatenate([p.uvw_m for p in parts]))
-        width = self.frame.width_hz
+        own, width = np.concatenate([at.uvw_m for at, _ in parts]), self.frame.width_hz
+        at = replace(parts[0][0], slots_s=rows.slots_s, own_uvw_m=own)
         return Recorded.of(at, float(rows.interval_s[0]), float(width[0]) if np.ptp(width) == 0 else None)
 
     def blocks(self) -> Iterator[Visibilities]:
         """Blocks in order of time, all channels each."""
+        with opened(self.path) as table:
+            for times in self._steps():
+                yield self._block(table, times)
+
+    def _steps(self) -> list[slice]:
         times, channels, baselines = self.shape
         step = int(max(1, BLOCK_BYTES // (64 * baselines * channels)))
-        with opened(self.path) as table:
-            for t in range(0, times, step):
-                yield self._block(table, slice(t, min(t + step, times)))
+        return [slice(t, min(t + step, times)) for t in range(0, times, step)]
 
     @checked
     def write(self, column: str, blocks: VisibilitySet | Iterable[Visibilities], overwrite: bool = False) -> None:
@@ -116,7 +109,8 @@ class MeasurementSet(VisibilitySet):
 
         The blocks are worked out and kept beside the set first: where that fails, the set is as it was. A column that
         is there is written with `overwrite` only. Rows that no block has, of autocorrelations and of other windows and
-        fields, stay as they are, zero in a new column. Raises `InputError` for blocks that are of something else.
+        fields, stay as they are, zero in a new column. Data are written, with the keywords of LOFAR on which beam has
+        been taken out; weights and flags are not. Raises `InputError` for blocks that are of something else.
         """
         with opened(self.path) as table:
             if column in table.columns() and not overwrite:
@@ -127,17 +121,19 @@ class MeasurementSet(VisibilitySet):
         with tempfile.TemporaryDirectory(dir=place, prefix=f".{Path(self.path).name}.") as folder:
             kept = Path(folder) / "blocks.h5"
             as_set(blocks).save(kept)
-            self._same(Store(kept))
+            self._same(store := Store(kept))
             with opened(self.path, writable=True) as table:
                 if column not in table.columns():
-                    _add(table, column, self.column)
+                    add_column(table, column, self.column)
                 for block in VisibilityFile(kept).blocks():
                     self._put(table, column, block)
+                with told(f"column {column}"):
+                    table.putcolkeywords(column, beam_words(store.beam_state))
 
     def _known(self, table: Any) -> None:
         if self.column not in table.columns():
-            cubes = [n for n in table.columns() if "omplex" in str(table.getcoldesc(n).get("valueType", "")).lower()
-                     or "COMPLEX" in str(table.getcoldesc(n).get("valueType", ""))]  # fmt: skip
+            kinds = {n: str(table.getcoldesc(n).get("valueType", "")).lower() for n in table.columns()}
+            cubes = [n for n, kind in kinds.items() if "complex" in kind]
             raise InputError(f"{self.path} has no column {self.column}: it has {', '.join(cubes) or 'no visibilities'}")
         kind = str(table.getcoldesc(self.column).get("valueType", "")).lower()
         if "complex" not in kind:
@@ -160,10 +156,7 @@ class MeasurementSet(VisibilitySet):
 
     def _block(self, table: Any, times: slice) -> Visibilities:
         rows, frame = self.rows, self.frame
-        numbers = rows.numbers[rows.begins[times.start] : rows.begins[times.stop]]
-        one, two, uvw = (_at(table, name, numbers) for name in ("ANTENNA1", "ANTENNA2", "UVW"))
-        place = self._there(times, one, two)
-        turned = one > two
+        at, given, numbers, place, turned = self._coordinates(table, times)
         shape = (times.stop - times.start, len(rows.antenna1))
 
         def grid(values: Any, lacking: Any) -> Any:
@@ -174,19 +167,15 @@ class MeasurementSet(VisibilitySet):
         data = frame.linear(self._cube(table, self.column, numbers))
         flags = self._cube(table, "FLAG", numbers).astype(bool)
         if "FLAG_ROW" in table.columns():
-            flags = flags | _at(table, "FLAG_ROW", numbers).astype(bool)[:, None, None]
+            flags = flags | at_rows(table, "FLAG_ROW", numbers).astype(bool)[:, None, None]
         flag = frame.spread(flags, True)
         weight = frame.spread(self._weight(table, numbers), 0.0)
         if turned.any():
-            swap = (slice(None), slice(None), slice(None), slice(None))
             data[turned] = np.conj(np.swapaxes(data[turned], -1, -2))
-            flag, weight = (np.array(x[swap]) for x in (flag, weight))
+            flag, weight = np.array(flag), np.array(weight)
             for x in (flag, weight):
                 x[turned] = np.swapaxes(x[turned], -1, -2)
-        seen = grid(np.ones(len(numbers), bool), False)
-        own = grid(np.where(turned[:, None], uvw, -uvw), np.nan)  # station 1 minus station 2
-        flag, weight = (_short(np.moveaxis(grid(x, lack), 1, 2)) for x, lack in ((flag, True), (weight, 0.0)))
-        at, given = self._at(times, own, seen)
+        flag, weight = (short(np.moveaxis(grid(x, lack), 1, 2)) for x, lack in ((flag, True), (weight, 0.0)))
         return Visibilities(
             data=np.moveaxis(grid(data, 0.0), 1, 2), at=at, antenna1=rows.antenna1, antenna2=rows.antenna2,
             interval_s=rows.interval_s[times], width_hz=frame.width_hz, weight=weight, flag=flag,
@@ -195,7 +184,7 @@ class MeasurementSet(VisibilitySet):
 
     def _cube(self, table: Any, name: str, numbers: Int) -> Any:
         """Values (N, F, n) of a column, channels ascending."""
-        values = _at(table, name, numbers)
+        values = at_rows(table, name, numbers)
         want = (len(numbers), len(self.frame.freq_hz), len(self.frame.kinds))
         if values.shape != want:
             raise FileError(f"{self.path}: {name} has shape {values.shape}, channels and correlations need {want}")
@@ -206,33 +195,59 @@ class MeasurementSet(VisibilitySet):
         if self.weights == "WEIGHT_SPECTRUM":
             values = self._cube(table, self.weights, numbers)
         elif self.weights == "WEIGHT":
-            values = np.broadcast_to(_at(table, "WEIGHT", numbers)[:, None], shape)
+            values = np.broadcast_to(at_rows(table, "WEIGHT", numbers)[:, None], shape)
         else:
             return np.ones(shape)
         values = np.asarray(values, float)
         return np.where(np.isfinite(values) & (values > 0), values, 0.0)
 
-    def _at(self, times: slice, own: Float, seen: Bool) -> tuple[Sampling, Float | None]:
-        """Coordinates, with the UVW of stations or, where these do not close, of baselines (T, B, 3)."""
+    def _coordinates(self, table: Any, times: slice) -> tuple[Sampling, Float | None, Int, Int, Bool]:
+        """Sampling, UVW of baselines (T, B, 3) where they are not those of stations; and of the rows of these times:
+
+        their numbers, where they stand among times and baselines, and whether antenna 1 is the later one.
+        """
         rows, frame = self.rows, self.frame
+        numbers = rows.numbers[rows.begins[times.start] : rows.begins[times.stop]]
+        one, two, uvw = (at_rows(table, name, numbers) for name in ("ANTENNA1", "ANTENNA2", "UVW"))
+        if not np.isfinite(uvw).all():
+            raise FileError(f"{self.path}: UVW is not finite, {times.stop - times.start} times from {times.start}")
+        place, turned = self._there(times, one, two), one > two
         slots, centre = rows.slots_s[times], frame.centre
         at = Sampling(
             frame.layout, earth_frame(times_of(slots), frame.layout.centre_m), slots, frame.freq_hz,
             np.array([centre.ra_rad]), np.array([centre.dec_rad]), centre,
             steered=None if frame.pointing == centre else frame.pointing,
         )  # fmt: skip
-        ours = at.uvw_m
-        stations = stations_seen(own, seen, rows.antenna1, rows.antenna2, ours)
-        if stations is not None:
-            return replace(at, own_uvw_m=stations), None
-        own = np.where(seen[..., None], own, ours[:, rows.antenna1] - ours[:, rows.antenna2])
-        return at, own
+        ours = at.uvw_m[:, rows.antenna1] - at.uvw_m[:, rows.antenna2]
+        own, seen = ours.copy(), np.zeros(ours.shape[:2], bool)
+        own.reshape(-1, 3)[place] = np.where(turned[:, None], uvw, -uvw)  # station 1 minus station 2
+        seen.ravel()[place] = True
+        if not times.start:
+            self._compare(own, ours)
+        stations = stations_seen(own, seen, rows.antenna1, rows.antenna2, at.uvw_m)
+        at, given = (at, own) if stations is None else (replace(at, own_uvw_m=stations), None)
+        return at, given, numbers, place, turned
+
+    def _compare(self, own: Float, ours: Float) -> None:
+        """Warn where the UVW of the file are not those of its stations, times and phase centre."""
+        size = float(np.sqrt((ours**2).sum())) or 1.0
+        apart, turned = (float(np.sqrt(((own - sign * ours) ** 2).sum())) / size for sign in (1, -1))
+        if turned < FAR:
+            warn(f"{self.path}: UVW are of the other sign, antenna 1 minus 2: what is imaged or predicted is mirrored")
+        elif apart > FAR:
+            warn(
+                f"{self.path}: UVW are {100 * apart:.2g} % off those of its stations, times and phase centre: another "
+                "centre, equinox or date? They are used as they stand"
+            )
 
     def _same(self, kept: Store) -> None:
         """Raise `InputError` unless what was kept is of these times, channels and baselines."""
         rows, small = self.rows, kept.small
         if kept.layout.names != self.frame.layout.names:
             raise InputError(f"the visibilities are of other stations than {self.path}")
+        centre = self.frame.centre
+        if np.abs(small["centre"] - np.array(centre)).max() > SAME_RAD:
+            raise InputError(f"the visibilities are about another phase centre than {self.path}, which has {centre}")
         for name in ("antenna1", "antenna2"):
             if not np.array_equal(small[name], getattr(rows, name)):
                 raise InputError(f"the visibilities are of other baselines than {self.path}")
@@ -247,7 +262,7 @@ class MeasurementSet(VisibilitySet):
         first = int(np.abs(rows.slots_s - block.at.slots_s[0]).argmin())
         times = slice(first, first + len(block.at.slots_s))
         numbers = rows.numbers[rows.begins[times.start] : rows.begins[times.stop]]
-        one, two = (_at(table, column_, numbers) for column_ in ("ANTENNA1", "ANTENNA2"))
+        one, two = (at_rows(table, station, numbers) for station in ("ANTENNA1", "ANTENNA2"))
         place = self._there(times, one, two)
         data = np.moveaxis(block.data, 1, 2).reshape(-1, len(block.freq_hz), 2, 2)[place]
         turned = one > two
@@ -258,78 +273,4 @@ class MeasurementSet(VisibilitySet):
             whole[:, channels] = data
             data = whole
         values = frame.correlated(data)
-        _into(table, name, numbers, values[:, ::-1] if frame.backwards else values)
-
-
-def _in_parts(table: Any, names: tuple[str, ...]) -> list[Any]:
-    """Columns of numbers, whole, read in parts."""
-    found: list[Any] = []
-    for name in names:
-        parts = [column(table, name, slice(r, r + AT_ONCE)) for r in range(0, table.nrow(), AT_ONCE)]
-        found.append(np.concatenate(parts))
-    return found
-
-
-def _filled(table: Any, name: str, rows: Rows) -> bool:
-    """Whether a column of weights is there and has values."""
-    if name not in table.columns():
-        return False
-    try:
-        return column(table, name, slice(int(rows.numbers[0]), int(rows.numbers[0]) + 1)).size > 0
-    except FileError:
-        return False  # declared, and empty
-
-
-def _rows(table: Any, frame: Frame, path: str) -> Rows:
-    """The rows of the window and field of a frame."""
-    described, fields, time, one, two = _in_parts(table, ("DATA_DESC_ID", "FIELD_ID", "TIME", "ANTENNA1", "ANTENNA2"))
-    mine = (described == frame.described) & (fields == frame.field)
-    autos = int((mine & (one == two)).sum())
-    numbers = np.flatnonzero(mine & (one != two))
-    if not len(numbers):
-        raise FileError(f"{path} has no cross-correlations of this window and field")
-    time, one, two = (x[numbers] for x in (time, one, two))
-    if not np.isfinite(time).all():
-        raise FileError(f"{path}: TIME is not finite")
-    stations = len(frame.layout)
-    if min(one.min(), two.min()) < 0 or max(one.max(), two.max()) >= stations:
-        raise FileError(f"{path}: rows are of station {max(one.max(), two.max())}, of {stations} that are described")
-    if np.any(np.diff(time) < 0):
-        order = np.argsort(time, kind="stable")
-        numbers, time, one, two = (x[order] for x in (numbers, time, one, two))
-    begins = np.append(np.flatnonzero(np.diff(time, prepend=-np.inf) > SAME_S), len(time))
-    pairs = np.unique(np.minimum(one, two).astype(np.int64) * stations + np.maximum(one, two))
-    interval = _at(table, "INTERVAL", numbers[begins[:-1]])
-    return Rows(numbers, begins, time[begins[:-1]], interval, pairs // stations, pairs % stations, autos)
-
-
-def _at(table: Any, name: str, numbers: Int) -> Any:
-    """Values of a column at some rows: those that follow each other in one go."""
-    if len(numbers) and numbers[-1] - numbers[0] + 1 == len(numbers) and np.all(np.diff(numbers) == 1):
-        return column(table, name, slice(int(numbers[0]), int(numbers[-1]) + 1))
-    with told(f"column {name}"):
-        return np.array(table.getcol(name, (np.asarray(numbers),)))
-
-
-def _into(table: Any, name: str, numbers: Int, values: Complex) -> None:
-    kind = np.complex128 if "d" in str(table.getcoldesc(name)["valueType"]).lower()[:1] else np.complex64
-    with told(f"column {name}"):
-        table.putcol(name, np.ascontiguousarray(values, kind), (np.asarray(numbers),))
-
-
-def _add(table: Any, name: str, like: str) -> None:
-    """A new column of the shape of another, zero."""
-    described = dict(table.getcoldesc(like))
-    described.update({"dataManagerGroup": f"Tiled{name}", "comment": "visibilities", "keywords": {}})
-    described["dataManagerType"] = "TiledShapeStMan" if "shape" not in described else "TiledColumnStMan"
-    with told(f"column {name}"):
-        table.addcols({name: described}, {})
-        for r in range(0, table.nrow(), BLOCK_ROWS):  # or it holds what the disk held
-            rows = slice(r, min(r + BLOCK_ROWS, table.nrow()))
-            table.putcol(name, np.zeros_like(column(table, like, rows)), (rows,))
-
-
-def _short(values: Any) -> Any:
-    """Values of correlations (T, F, B, 2, 2) as (T, F, B) where all four are alike."""
-    first = values[..., 0, 0]
-    return first.copy() if np.all(values == first[..., None, None]) else values
+        put_rows(table, name, numbers, values[:, ::-1] if frame.backwards else values)

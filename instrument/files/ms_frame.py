@@ -25,7 +25,7 @@ TO_CIRCULAR = np.array([[1, 1j], [1, -1j]]) / np.sqrt(2)
 
 @dataclass(frozen=True)
 class Frame:
-    """One window and field of a set. `numbers` are the rows of DATA_DESCRIPTION with that window and correlations."""
+    """One window and field of a set."""
 
     __repr__ = short_repr
     layout: Layout
@@ -52,7 +52,7 @@ class Frame:
         return TO_CIRCULAR.conj().T @ found @ TO_CIRCULAR if order is CIRCULAR else found
 
     def spread(self, values: Any, lacking: Any) -> Any:
-        """Weights or flags (..., n) as (..., 2, 2), `lacking` where nothing was correlated."""
+        """Weights or flags (..., n) as (..., 2, 2): of circular ones the worst, `lacking` where there is none."""
         if self.kinds[0] in CIRCULAR:  # each linear one has all four in it
             worst = values.min(axis=-1) if values.dtype != bool else values.any(axis=-1)
             return np.broadcast_to(worst[..., None, None], (*values.shape[:-1], 2, 2))
@@ -185,3 +185,14 @@ def beam_state_of(words: dict[str, Any], path: str) -> BeamState:
     if mode != "Full":
         warn(f"{path}: of the beam only the part '{mode}' has been taken out")
     return BeamState("centre", Direction(ra % (2 * np.pi), dec), None, mode != "Full")
+
+
+def beam_words(state: BeamState) -> dict[str, Any]:
+    """The keywords of LOFAR for what has been taken out."""
+    if state.removed != "centre" or state.towards is None:
+        return {"LOFAR_APPLIED_BEAM_MODE": "None"}
+    ra, dec = ({"value": float(x), "unit": "rad"} for x in state.towards)
+    return {
+        "LOFAR_APPLIED_BEAM_MODE": "Full",
+        "LOFAR_APPLIED_BEAM_DIR": {"type": "direction", "refer": "J2000", "m0": ra, "m1": dec},
+    }

@@ -11,8 +11,6 @@ from instrument.observe.observation import Observation
 from instrument.observe.sampling import Sampling, times_of
 from instrument.units import ArrayOf, Direction, Float
 
-NEAR_M = 1.0  # positions of a station in a file and of ours: those of another station are 10 m away
-
 
 class Recorded(Observation):
     """An observation at times of its own, which may be irregular, with the UVW of its stations.

@@ -117,7 +117,9 @@ class Sampling:
         """
         own, ours = self.own_uvw_m, replace(self, own_uvw_m=None).uvw_m
         assert own is not None
-        near = np.abs(made.slots_s[:, None] - self.slots_s).argmin(axis=1)
+        order = np.argsort(self.slots_s)
+        middles = (self.slots_s[order][1:] + self.slots_s[order][:-1]) / 2
+        near = order[np.searchsorted(middles, made.slots_s)]
         turn = _rotations(ours, own)
         rest = own - ours @ np.swapaxes(turn, 1, 2)
         return np.asarray(made.uvw_m @ np.swapaxes(turn, 1, 2)[near] + rest[near])

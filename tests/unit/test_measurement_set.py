@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import instrument
 from instrument import InputError
@@ -14,6 +15,8 @@ from instrument.errors import FileError, InstrumentWarning
 from instrument.files import measurement_set
 from instrument.files.measurement_set import MeasurementSet
 from instrument.files.ms_frame import TO_CIRCULAR
+from instrument.observe.sampling import Sampling, times_of
+from instrument.units import Direction
 
 pytest.importorskip("arcae", reason="the extra 'ms'")
 spec = importlib.util.spec_from_file_location("small_set", Path(__file__).with_name("small_set.py"))
@@ -30,13 +33,17 @@ def layout():
     return instrument.load("telescopes", "lofar-hba", stations=names).layout()
 
 
+CENTRE = (2.15, 0.84)
+
+
 @pytest.fixture
 def whole(layout):
-    """Times (T,), station UVW (T, A, 3), and data (T, B, F, 4), float32 exactly."""
+    """Times (T,), station UVW (T, A, 3) of an Earth turned by 2.4e-6, and data (T, B, F, 4), float32 exactly."""
     rng = np.random.default_rng(3)
     time = 4861566000.0 + np.array([0, 10, 20, 50.0])  # a gap
-    turn = np.linalg.qr(rng.standard_normal((TIMES, 3, 3)))[0]
-    uvw = (layout.positions_m - layout.centre_m) @ turn
+    centre = Direction(*CENTRE)
+    at = Sampling.build(layout, times_of(time), FREQ, *np.atleast_2d(CENTRE).T, centre)
+    uvw = at.uvw_m @ Rotation.from_rotvec([1e-6, -1e-6, 2e-6]).as_matrix()
     data = (rng.standard_normal((TIMES, len(A), len(FREQ), 4, 2)).astype(np.float32) @ [1, 1j]).astype(np.complex64)
     return time, uvw, data.astype(complex)
 
@@ -250,3 +257,44 @@ def test_a_scene_is_predicted_with_the_times_and_uvw_of_the_set(tmp_path, layout
     assert np.abs(predicted.data[..., 0, 0] - want).max() < 1e-8
     one.write("MODEL_DATA", predicted)
     assert np.abs(read(tmp_path / "a.MS", column="MODEL_DATA").data - predicted.data).max() < 1e-6
+
+
+def test_uvw_of_another_sign_or_centre_are_said_and_those_that_are_not_numbers_refused(tmp_path, layout, whole):
+    rows, data = rows_of(whole)
+    time, one, two, uvw, window, field = rows
+    for name, other, said in (("sign", -uvw, "of the other sign"), ("centre", uvw[:, [1, 2, 0]], "% off those of its")):
+        small_set.write(tmp_path / name, layout, (time, one, two, other, window, field), FREQ, data)
+        with pytest.warns(InstrumentWarning, match=said):
+            read(tmp_path / name)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # half an arcsecond is what programs differ by
+        small_set.write(tmp_path / "a.MS", layout, rows, FREQ, data)
+        read(tmp_path / "a.MS")
+    uvw[7, 1] = np.nan
+    small_set.write(tmp_path / "nan.MS", layout, rows, FREQ, data)
+    with pytest.raises(FileError, match="UVW is not finite"):
+        read(tmp_path / "nan.MS")
+
+
+def test_a_column_says_which_beam_has_been_taken_out_and_is_of_the_phase_centre(tmp_path, layout, whole):
+    rows, data = rows_of(whole)
+    small_set.write(tmp_path / "a.MS", layout, rows, FREQ, data)
+    one, plain = MeasurementSet(tmp_path / "a.MS"), read(tmp_path / "a.MS")
+    lofar = instrument.load("telescopes", "lofar-hba", stations=list(layout.names))
+    one.write("CORRECTED_DATA", [plain.without_beam(lofar)])
+    state = MeasurementSet(tmp_path / "a.MS", column="CORRECTED_DATA").beam_state
+    assert state.removed == "centre" and np.allclose(state.towards, CENTRE, atol=1e-12)
+    one.write("CORRECTED_DATA", [plain], overwrite=True)
+    assert MeasurementSet(tmp_path / "a.MS", column="CORRECTED_DATA").beam_state.removed == "nothing"
+    with pytest.raises(InputError, match="about another phase centre"):
+        one.write("MODEL_DATA", [plain.shifted_to("8h20m +50d")])
+
+
+def test_one_time_one_baseline_and_all_flagged_are_read(tmp_path, layout, whole):
+    rows, data = rows_of(whole)
+    small_set.write(
+        tmp_path / "a.MS", layout, [x[:1] for x in rows], FREQ, data[:1], flag=np.ones(data[:1].shape, bool)
+    )
+    found = read(tmp_path / "a.MS")
+    assert found.data.shape == (1, 3, 1, 2, 2) and found.flag.all() and not found.effective_weight.any()
+    assert np.abs(found.uvw_m[0, 0] + rows[3][0]).max() < 1e-8

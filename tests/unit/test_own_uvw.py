@@ -7,7 +7,7 @@ import pytest
 from astropy import units as u
 
 import instrument
-from instrument import Observation, PointSky, Scene, Visibilities
+from instrument import ImageGrid, ImageSky, Observation, PointSky, Scene, Visibilities
 from instrument.observe.directions import offset
 
 TURN = 2.4e-6  # rad: the Earth of casacore and ours
@@ -47,23 +47,23 @@ def test_blocks_and_other_times_have_the_own_ones(at):
     assert np.abs(later - at.uvw_m[12:20]).max() < 1e-4 * apart
 
 
-def test_every_engine_takes_them(scene, at):
-    """The definition, summed here, and each engine."""
-    from instrument.predict.base import Predictor
+@pytest.mark.parametrize("engine", ["matrix", "gridded"])
+def test_every_engine_takes_them(scene, at, engine):
+    """Held to the definition with the same UVW: a list of points for one, pixels for the other."""
+    stokes = np.zeros((1, 4, 32, 32))
+    stokes[0, 0, 5, 7], stokes[0, 0, 20, 28], stokes[0, :2, 16, 15] = 3.0, 2.0, (1.0, 0.2)
+    image = ImageSky(grid=ImageGrid(pixels=32, pixel=20 * u.arcmin), stokes=stokes)
+    sky = image if engine == "gridded" else scene.sky
+    plan = Scene(instrument=scene.instrument.with_fields(beam=None), sky=sky, observation=scene.observation).plan()
+    own = replace(plan.problem, at=at.towards(plan.problem.at.ra_rad, plan.problem.at.dec_rad))
+    everything = slice(0, 20), slice(0, 2)
 
-    plan = scene.plan()
-    problem = replace(plan.problem, at=at)
-    for name in ("direct", "matrix"):
-        engine: Predictor = instrument.load("engines", name)
-        block, plain = (
-            engine.prepare(p, 1e-9).predict(slice(0, 20), slice(0, 2)).data for p in (problem, plan.problem)
-        )
-        moved = np.abs(block - plain).max()
-        assert moved > 1e-3  # the turn is seen
-        if name == "direct":
-            known = block
-        else:
-            assert np.abs(block - known).max() < 1e-8
+    def data(name, problem):
+        return instrument.load("engines", name).prepare(problem, 1e-7).predict(*everything).data
+
+    known = data("direct", own)
+    assert np.abs(known - data("direct", plan.problem)).max() > 1e-3  # the turn is seen
+    assert np.abs(data(engine, own) - known).max() < 1e-6  # of 6 Jy
 
 
 def test_files_averages_and_other_centres_keep_them(scene, at, tmp_path):
@@ -77,3 +77,20 @@ def test_files_averages_and_other_centres_keep_them(scene, at, tmp_path):
     there = vis.shifted_to("08h20m00s +50d00m00s")
     assert np.abs(there.shifted_to(vis.phase_centre).data - vis.data).max() < 1e-9
     assert np.abs(np.linalg.norm(there.uvw_m, axis=-1) - np.linalg.norm(vis.uvw_m, axis=-1)).max() < 1e-6
+
+
+def test_own_ones_that_do_not_fit_or_are_not_numbers_are_refused(scene, at, tmp_path):
+    from instrument import InputError
+
+    vis = scene.plan().run()
+    for wrong in (at.own_uvw_m[:, :2], np.full_like(at.own_uvw_m, np.nan)):
+        with pytest.raises(InputError, match="own_uvw_m has shape"):
+            replace(vis, at=replace(at, own_uvw_m=wrong))
+
+
+def test_a_check_of_other_uvw_is_refused(scene, at):
+    from instrument import InputError
+
+    plan = scene.plan()
+    with pytest.raises(InputError, match="UVW of their own"):
+        plan.verify(replace(plan.run(), at=at))

@@ -1,0 +1,103 @@
+"""Rows of a Measurement Set: which are of one window and field, in order of time; their values read and written."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from instrument.errors import FileError
+from instrument.files.ms_frame import Frame
+from instrument.files.ms_tables import column, told
+from instrument.units import Complex, Float, Int
+
+AT_ONCE = 1_000_000  # rows of what tells where the rows are
+BLOCK_ROWS = 10_000  # of a new column that are written at once
+SAME_S = 1e-3  # times as near as this are one
+
+
+class Rows(NamedTuple):
+    """Where the rows of one window and field are: their numbers, in order of time, and the times of these."""
+
+    numbers: Int  # (N,)
+    begins: Int  # (T + 1,) of `numbers`
+    slots_s: Float  # (T,)
+    interval_s: Float  # (T,)
+    antenna1: Int  # (B,) of all baselines, antenna1 < antenna2
+    antenna2: Int
+    autos: int  # rows left out
+
+
+def in_parts(table: Any, names: tuple[str, ...]) -> list[Any]:
+    """Columns of numbers, whole, read in parts."""
+    found: list[Any] = []
+    for name in names:
+        parts = [column(table, name, slice(r, r + AT_ONCE)) for r in range(0, table.nrow(), AT_ONCE)]
+        found.append(np.concatenate(parts))
+    return found
+
+
+def filled(table: Any, name: str, rows: Rows) -> bool:
+    """Whether a column of weights is there and has values."""
+    if name not in table.columns():
+        return False
+    try:
+        return column(table, name, slice(int(rows.numbers[0]), int(rows.numbers[0]) + 1)).size > 0
+    except FileError:
+        return False  # declared, and empty
+
+
+def rows_of(table: Any, frame: Frame, path: str) -> Rows:
+    """The rows of the window and field of a frame."""
+    described, fields, time, one, two = in_parts(table, ("DATA_DESC_ID", "FIELD_ID", "TIME", "ANTENNA1", "ANTENNA2"))
+    mine = (described == frame.described) & (fields == frame.field)
+    autos = int((mine & (one == two)).sum())
+    numbers = np.flatnonzero(mine & (one != two))
+    if not len(numbers):
+        raise FileError(f"{path} has no cross-correlations of this window and field")
+    time, one, two = (x[numbers] for x in (time, one, two))
+    if not np.isfinite(time).all():
+        raise FileError(f"{path}: TIME is not finite")
+    stations = len(frame.layout)
+    if min(one.min(), two.min()) < 0 or max(one.max(), two.max()) >= stations:
+        raise FileError(f"{path}: rows are of station {max(one.max(), two.max())}, of {stations} that are described")
+    if np.any(np.diff(time) < 0):
+        order = np.argsort(time, kind="stable")
+        numbers, time, one, two = (x[order] for x in (numbers, time, one, two))
+    begins = np.append(np.flatnonzero(np.diff(time, prepend=-np.inf) > SAME_S), len(time))
+    pairs = np.unique(np.minimum(one, two).astype(np.int64) * stations + np.maximum(one, two))
+    interval = at_rows(table, "INTERVAL", numbers[begins[:-1]])
+    return Rows(numbers, begins, time[begins[:-1]], interval, pairs // stations, pairs % stations, autos)
+
+
+def at_rows(table: Any, name: str, numbers: Int) -> Any:
+    """Values of a column at some rows: those that follow each other in one go."""
+    if len(numbers) and numbers[-1] - numbers[0] + 1 == len(numbers) and np.all(np.diff(numbers) == 1):
+        return column(table, name, slice(int(numbers[0]), int(numbers[-1]) + 1))
+    with told(f"column {name}"):
+        return np.array(table.getcol(name, (np.asarray(numbers),)))
+
+
+def put_rows(table: Any, name: str, numbers: Int, values: Complex) -> None:
+    """Write values of some rows in the precision of the column."""
+    kind = np.complex128 if str(table.getcoldesc(name)["valueType"]).lower().startswith("d") else np.complex64
+    with told(f"column {name}"):
+        table.putcol(name, np.ascontiguousarray(values, kind), (np.asarray(numbers),))
+
+
+def add_column(table: Any, name: str, like: str) -> None:
+    """A new column of the shape of another, zero."""
+    described = dict(table.getcoldesc(like))
+    described.update({"dataManagerGroup": f"Tiled{name}", "comment": "visibilities", "keywords": {}})
+    described["dataManagerType"] = "TiledShapeStMan" if "shape" not in described else "TiledColumnStMan"
+    with told(f"column {name}"):
+        table.addcols({name: described}, {})
+        for r in range(0, table.nrow(), BLOCK_ROWS):  # or it holds what the disk held
+            rows = slice(r, min(r + BLOCK_ROWS, table.nrow()))
+            table.putcol(name, np.zeros_like(column(table, like, rows)), (rows,))
+
+
+def short(values: Any) -> Any:
+    """Values of correlations (T, F, B, 2, 2) as (T, F, B) where all four are alike."""
+    first = values[..., 0, 0]
+    return first.copy() if np.all(values == first[..., None, None]) else values
