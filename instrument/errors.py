@@ -94,7 +94,9 @@ class Outcome(Enum):
     """How a solve ended; the value is the advice."""
 
     CONVERGED = "converged"
-    ITERATION_LIMIT = "stopped at the iteration limit, or long no nearer: raise it, or start nearer to the answer"
+    ITERATION_LIMIT = (
+        "stopped at the iteration limit, or long no nearer: raise the limit, or start nearer to the answer"
+    )
     SINGULAR = "the equations do not determine the answer: remove sources that coincide, or add data"
     NON_FINITE = "the input holds NaN or infinity: flag it first"
     POOR_FIT = "most of the data stay unexplained: a wrong model, a wrong start, or noise above the signal"
