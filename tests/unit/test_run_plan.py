@@ -279,3 +279,14 @@ def test_a_pipe_or_a_file_without_end_in_the_place_of_the_speed_holds_nothing_up
     monkeypatch.setattr(Path, "read_text", lambda *a, **k: pytest.fail("read whole, without a look at what it is"))
     assert machine.speed() == 0.6
     assert json.loads(path.read_bytes())["speed"] == 0.6
+
+
+def test_as_many_figures_are_planned_as_a_cube_is_given(tmp_path):
+    """Day and night forms count as one; what a page takes is most of the time of a small run."""
+    tables = override(read_tables("galactic-quick"), [
+        "observation.frequency.channels=4", "observation.duration=20 min", "observation.interval=10 min",
+        "instrument.stations=['CS001HBA0', 'CS002HBA0', 'CS003HBA0', 'CS004HBA0']", "sky.pixels=32", "image.pixels=32",
+    ])  # fmt: skip
+    result = run(parse(tables), tables, out=str(tmp_path / "r"), verify=False)
+    made = [p.name for p in (tmp_path / "r").glob("*.png")]
+    assert result.whole.works["write"].does == f"tables, page, {len(made)} figures", made

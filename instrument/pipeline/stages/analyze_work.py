@@ -61,7 +61,8 @@ def cube_products(settings: CubeAnalysis, channels: int, pixels: int) -> StageWo
         most, figures = max(most, 200.0 * pixels), figures + 1
     if settings.wants("cylindrical") or settings.wants("spherical"):
         seconds += 4 * 2e-7 * voxels
-        most, figures = max(most, 40 * voxels), figures + 2
+        most = max(most, 40 * voxels)
+        figures += 3 * settings.wants("cylindrical") + settings.wants("spherical")  # of I, P and V; one of all
     if settings.remove is not None:
         seconds += 1e-6 * voxels
         held += 2 * 8 * 4 * voxels
