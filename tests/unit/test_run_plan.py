@@ -286,6 +286,7 @@ def test_as_many_figures_are_planned_as_a_cube_is_given(tmp_path):
     tables = override(read_tables("galactic-quick"), [
         "observation.frequency.channels=4", "observation.duration=20 min", "observation.interval=10 min",
         "instrument.stations=['CS001HBA0', 'CS002HBA0', 'CS003HBA0', 'CS004HBA0']", "sky.pixels=32", "image.pixels=32",
+        "analyze.cube={products=['cylindrical', 'spherical', 'faraday', 'spectrum-2d'], depths=[-5, 5, 1], bins=4}",
     ])  # fmt: skip
     result = run(parse(tables), tables, out=str(tmp_path / "r"), verify=False)
     made = [p.name for p in (tmp_path / "r").glob("*.png")]
