@@ -2,8 +2,8 @@
 
     python docs/reports/fuzz.py [COUNT] [SEED] [--dry]
 
-Every case is a forked process with limits (20 s of CPU, 2 GB). It must be done and whole, or refused in one line with
-nothing left behind. `--dry` prints the faults alone and writes nothing.
+Every case is a forked process with limits (20 s of CPU, more on a slower machine; 2 GB). It must be done and whole, or
+refused in one line with nothing left behind. `--dry` prints the faults alone and writes nothing.
 """
 
 import platform
