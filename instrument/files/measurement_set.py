@@ -13,20 +13,17 @@ import numpy as np
 
 from instrument.checked import checked
 from instrument.errors import FileError, InputError, warn
+from instrument.files.by_rows import SAME_S, Where, block_of, coordinates, places
 from instrument.files.ms_frame import beam_state_of, beam_words, frame_of
-from instrument.files.ms_rows import SAME_S, add_column, at_rows, filled, in_parts, put_rows, rows_of, short
+from instrument.files.ms_rows import add_column, at_rows, filled, in_parts, put_rows, rows_of
 from instrument.files.ms_tables import demand, opened, told
-from instrument.observe.closure import stations_seen
-from instrument.observe.directions import earth_frame
 from instrument.observe.recorded import Recorded
-from instrument.observe.sampling import Sampling, times_of
 from instrument.store import Store
-from instrument.units import Bool, Float, Int
+from instrument.units import Float, Int
 from instrument.visibilities import Visibilities, VisibilitySet
 from instrument.visibility_sets import BLOCK_BYTES, VisibilityFile, as_set
 
 SAME_RAD = 1e-9  # phase centres as near as this are one
-FAR = 0.01  # 0.6 deg: precession from J2000 to 2050 is 0.7
 NEEDED = ("TIME", "INTERVAL", "ANTENNA1", "ANTENNA2", "DATA_DESC_ID", "FIELD_ID", "UVW", "FLAG")
 
 
@@ -83,13 +80,13 @@ class MeasurementSet(VisibilitySet):
         """
         rows = self.rows
         with opened(self.path) as table:
-            parts = [self._coordinates(table, times)[:2] for times in self._steps()]
-        if any(given is not None for _, given in parts):
+            parts = [self._coordinates(table, times) for times in self._steps()]
+        if any(part.given_uvw_m is not None for part in parts):
             raise InputError(f"{self.path}: its UVW do not close around triangles of stations: nothing is predicted")
         if np.ptp(rows.interval_s) > SAME_S:
             raise InputError(f"{self.path}: integrations of {rows.interval_s.min():g} to {rows.interval_s.max():g} s")
-        own, width = np.concatenate([at.uvw_m for at, _ in parts]), self.frame.width_hz
-        at = replace(parts[0][0], slots_s=rows.slots_s, own_uvw_m=own)
+        own, width = np.concatenate([part.at.uvw_m for part in parts]), self.frame.width_hz
+        at = replace(parts[0].at, slots_s=rows.slots_s, own_uvw_m=own)
         return Recorded.of(at, float(rows.interval_s[0]), float(width[0]) if np.ptp(width) == 0 else None)
 
     def blocks(self) -> Iterator[Visibilities]:
@@ -99,9 +96,7 @@ class MeasurementSet(VisibilitySet):
                 yield self._block(table, times)
 
     def _steps(self) -> list[slice]:
-        times, channels, baselines = self.shape
-        step = int(max(1, BLOCK_BYTES // (64 * baselines * channels)))
-        return [slice(t, min(t + step, times)) for t in range(0, times, step)]
+        return self.rows.steps(BLOCK_BYTES, len(self.freq_hz))
 
     @checked
     def write(self, column: str, blocks: VisibilitySet | Iterable[Visibilities], overwrite: bool = False) -> None:
@@ -139,48 +134,13 @@ class MeasurementSet(VisibilitySet):
         if "complex" not in kind:
             raise InputError(f"{self.path}: column {self.column} holds {kind}, not visibilities")
 
-    def _there(self, times: slice, one: Int, two: Int) -> Int:
-        """Where each row of some times stands among the baselines; raises `FileError` for a baseline that is twice."""
-        rows, stations = self.rows, len(self.frame.layout)
-        low, high = np.minimum(one, two), np.maximum(one, two)
-        names = rows.antenna1 * stations + rows.antenna2
-        found = np.searchsorted(names, low * stations + high)
-        slot = np.repeat(np.arange(times.stop - times.start), np.diff(rows.begins[times.start : times.stop + 1]))
-        place = slot * len(names) + found
-        if len(np.unique(place)) < len(place):
-            twice = int(slot[np.flatnonzero(np.diff(np.sort(place)) == 0)[0]]) if len(place) else 0
-            raise FileError(
-                f"{self.path}: a baseline has two rows at time {times.start + twice} of this window and field"
-            )
-        return np.asarray(place)
-
     def _block(self, table: Any, times: slice) -> Visibilities:
-        rows, frame = self.rows, self.frame
-        at, given, numbers, place, turned = self._coordinates(table, times)
-        shape = (times.stop - times.start, len(rows.antenna1))
-
-        def grid(values: Any, lacking: Any) -> Any:
-            out = np.full((shape[0] * shape[1], *values.shape[1:]), lacking, values.dtype)
-            out[place] = values
-            return out.reshape(*shape, *values.shape[1:])
-
-        data = frame.linear(self._cube(table, self.column, numbers))
+        where, numbers = self._coordinates(table, times), self.rows.of(times)
         flags = self._cube(table, "FLAG", numbers).astype(bool)
         if "FLAG_ROW" in table.columns():
             flags = flags | at_rows(table, "FLAG_ROW", numbers).astype(bool)[:, None, None]
-        flag = frame.spread(flags, True)
-        weight = frame.spread(self._weight(table, numbers), 0.0)
-        if turned.any():
-            data[turned] = np.conj(np.swapaxes(data[turned], -1, -2))
-            flag, weight = np.array(flag), np.array(weight)
-            for x in (flag, weight):
-                x[turned] = np.swapaxes(x[turned], -1, -2)
-        flag, weight = (short(np.moveaxis(grid(x, lack), 1, 2)) for x, lack in ((flag, True), (weight, 0.0)))
-        return Visibilities(
-            data=np.moveaxis(grid(data, 0.0), 1, 2), at=at, antenna1=rows.antenna1, antenna2=rows.antenna2,
-            interval_s=rows.interval_s[times], width_hz=frame.width_hz, weight=weight, flag=flag,
-            beam_state=self.beam_state, given_uvw_m=given,
-        )  # fmt: skip
+        data, weight = self._cube(table, self.column, numbers), self._weight(table, numbers)
+        return block_of(self.frame, self.rows, times, where, data, flags, weight, self.beam_state)
 
     def _cube(self, table: Any, name: str, numbers: Int) -> Any:
         """Values (N, F, n) of a column, channels ascending."""
@@ -201,44 +161,10 @@ class MeasurementSet(VisibilitySet):
         values = np.asarray(values, float)
         return np.where(np.isfinite(values) & (values > 0), values, 0.0)
 
-    def _coordinates(self, table: Any, times: slice) -> tuple[Sampling, Float | None, Int, Int, Bool]:
-        """Sampling, UVW of baselines (T, B, 3) where they are not those of stations; and of the rows of these times:
-
-        their numbers, where they stand among times and baselines, and whether antenna 1 is the later one.
-        """
-        rows, frame = self.rows, self.frame
-        numbers = rows.numbers[rows.begins[times.start] : rows.begins[times.stop]]
+    def _coordinates(self, table: Any, times: slice) -> Where:
+        numbers = self.rows.of(times)
         one, two, uvw = (at_rows(table, name, numbers) for name in ("ANTENNA1", "ANTENNA2", "UVW"))
-        if not np.isfinite(uvw).all():
-            raise FileError(f"{self.path}: UVW is not finite, {times.stop - times.start} times from {times.start}")
-        place, turned = self._there(times, one, two), one > two
-        slots, centre = rows.slots_s[times], frame.centre
-        at = Sampling(
-            frame.layout, earth_frame(times_of(slots), frame.layout.centre_m), slots, frame.freq_hz,
-            np.array([centre.ra_rad]), np.array([centre.dec_rad]), centre,
-            steered=None if frame.pointing == centre else frame.pointing,
-        )  # fmt: skip
-        ours = at.uvw_m[:, rows.antenna1] - at.uvw_m[:, rows.antenna2]
-        own, seen = ours.copy(), np.zeros(ours.shape[:2], bool)
-        own.reshape(-1, 3)[place] = np.where(turned[:, None], uvw, -uvw)  # station 1 minus station 2
-        seen.ravel()[place] = True
-        if not times.start:
-            self._compare(own, ours)
-        stations = stations_seen(own, seen, rows.antenna1, rows.antenna2, at.uvw_m)
-        at, given = (at, own) if stations is None else (replace(at, own_uvw_m=stations), None)
-        return at, given, numbers, place, turned
-
-    def _compare(self, own: Float, ours: Float) -> None:
-        """Warn where the UVW of the file are not those of its stations, times and phase centre."""
-        size = float(np.sqrt((ours**2).sum())) or 1.0
-        apart, turned = (float(np.sqrt(((own - sign * ours) ** 2).sum())) / size for sign in (1, -1))
-        if turned < FAR:
-            warn(f"{self.path}: UVW are of the other sign, antenna 1 minus 2: what is imaged or predicted is mirrored")
-        elif apart > FAR:
-            warn(
-                f"{self.path}: UVW are {100 * apart:.2g} % off those of its stations, times and phase centre: another "
-                "centre, equinox or date? They are used as they stand"
-            )
+        return coordinates(self.path, self.frame, self.rows, times, one, two, uvw)
 
     def _same(self, kept: Store) -> None:
         """Raise `InputError` unless what was kept is of these times, channels and baselines."""
@@ -261,9 +187,9 @@ class MeasurementSet(VisibilitySet):
         rows, frame = self.rows, self.frame
         first = int(np.abs(rows.slots_s - block.at.slots_s[0]).argmin())
         times = slice(first, first + len(block.at.slots_s))
-        numbers = rows.numbers[rows.begins[times.start] : rows.begins[times.stop]]
+        numbers = rows.of(times)
         one, two = (at_rows(table, station, numbers) for station in ("ANTENNA1", "ANTENNA2"))
-        place = self._there(times, one, two)
+        place = places(self.path, rows, len(frame.layout), times, one, two)
         data = np.moveaxis(block.data, 1, 2).reshape(-1, len(block.freq_hz), 2, 2)[place]
         turned = one > two
         data[turned] = np.conj(np.swapaxes(data[turned], -1, -2))

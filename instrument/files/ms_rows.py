@@ -2,30 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from instrument.errors import FileError
+from instrument.files.by_rows import Rows, in_time
 from instrument.files.ms_frame import Frame
 from instrument.files.ms_tables import column, told
-from instrument.units import Complex, Float, Int
+from instrument.units import Complex, Int
 
 AT_ONCE = 1_000_000  # rows of what tells where the rows are
 BLOCK_ROWS = 10_000  # of a new column that are written at once
-SAME_S = 1e-3  # times as near as this are one
-
-
-class Rows(NamedTuple):
-    """Where the rows of one window and field are: their numbers, in order of time, and the times of these."""
-
-    numbers: Int  # (N,)
-    begins: Int  # (T + 1,) of `numbers`
-    slots_s: Float  # (T,)
-    interval_s: Float  # (T,)
-    antenna1: Int  # (B,) of all baselines, antenna1 < antenna2
-    antenna2: Int
-    autos: int  # rows left out
 
 
 def in_parts(table: Any, names: tuple[str, ...]) -> list[Any]:
@@ -55,19 +43,9 @@ def rows_of(table: Any, frame: Frame, path: str) -> Rows:
     numbers = np.flatnonzero(mine & (one != two))
     if not len(numbers):
         raise FileError(f"{path} has no cross-correlations of this window and field")
-    time, one, two = (x[numbers] for x in (time, one, two))
-    if not np.isfinite(time).all():
-        raise FileError(f"{path}: TIME is not finite")
-    stations = len(frame.layout)
-    if min(one.min(), two.min()) < 0 or max(one.max(), two.max()) >= stations:
-        raise FileError(f"{path}: rows are of station {max(one.max(), two.max())}, of {stations} that are described")
-    if np.any(np.diff(time) < 0):
-        order = np.argsort(time, kind="stable")
-        numbers, time, one, two = (x[order] for x in (numbers, time, one, two))
-    begins = np.append(np.flatnonzero(np.diff(time, prepend=-np.inf) > SAME_S), len(time))
-    pairs = np.unique(np.minimum(one, two).astype(np.int64) * stations + np.maximum(one, two))
-    interval = at_rows(table, "INTERVAL", numbers[begins[:-1]])
-    return Rows(numbers, begins, time[begins[:-1]], interval, pairs // stations, pairs % stations, autos)
+    found = in_time(numbers, *(x[numbers] for x in (time, one, two)), len(frame.layout), path)
+    interval = at_rows(table, "INTERVAL", found.numbers[found.begins[:-1]])
+    return found._replace(interval_s=interval, autos=autos)
 
 
 def at_rows(table: Any, name: str, numbers: Int) -> Any:
@@ -95,9 +73,3 @@ def add_column(table: Any, name: str, like: str) -> None:
         for r in range(0, table.nrow(), BLOCK_ROWS):  # or it holds what the disk held
             rows = slice(r, min(r + BLOCK_ROWS, table.nrow()))
             table.putcol(name, np.zeros_like(column(table, like, rows)), (rows,))
-
-
-def short(values: Any) -> Any:
-    """Values of correlations (T, F, B, 2, 2) as (T, F, B) where all four are alike."""
-    first = values[..., 0, 0]
-    return first.copy() if np.all(values == first[..., None, None]) else values

@@ -1,0 +1,149 @@
+"""Files of rows, one baseline at one time each: where rows stand, their coordinates, the block that they make."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from instrument.beam_state import BeamState
+from instrument.errors import FileError, warn
+from instrument.files.ms_frame import Frame
+from instrument.observe.closure import stations_seen
+from instrument.observe.directions import earth_frame
+from instrument.observe.sampling import Sampling, times_of
+from instrument.units import Bool, Complex, Float, Int
+from instrument.visibilities import Visibilities
+
+SAME_S = 1e-3  # times as near as this are one
+FAR = 0.01  # 0.6 deg: precession from J2000 to 2050 is 0.7
+
+
+class Rows(NamedTuple):
+    """Where the rows of one window and field are: their numbers, in order of time, and the times of these."""
+
+    numbers: Int  # (N,)
+    begins: Int  # (T + 1,) of `numbers`
+    slots_s: Float  # (T,)
+    interval_s: Float  # (T,)
+    antenna1: Int  # (B,) of all baselines, antenna1 < antenna2
+    antenna2: Int
+    autos: int  # rows left out
+
+    def of(self, times: slice) -> Int:
+        """The rows of some times."""
+        return self.numbers[self.begins[times.start] : self.begins[times.stop]]
+
+    def steps(self, most_bytes: float, channels: int) -> list[slice]:
+        """Times that follow each other, of so many bytes of data together."""
+        step = int(max(1, most_bytes // (64 * len(self.antenna1) * channels)))
+        return [slice(t, min(t + step, len(self.slots_s))) for t in range(0, len(self.slots_s), step)]
+
+
+class Where(NamedTuple):
+    """Coordinates of the rows of some times: the `Sampling`, UVW of baselines (T, B, 3) where stations have none.
+
+    `place` is where each row stands among times and baselines; `turned` whether its antenna 1 is the later one.
+    """
+
+    at: Sampling
+    given_uvw_m: Float | None
+    place: Int
+    turned: Bool
+
+
+def in_time(numbers: Int, time: Float, one: Int, two: Int, stations: int, path: str) -> Rows:
+    """Rows of cross-correlations in order of time, `interval_s` still those of nothing."""
+    if not np.isfinite(time).all():
+        raise FileError(f"{path}: TIME is not finite")
+    if min(one.min(), two.min()) < 0 or max(one.max(), two.max()) >= stations:
+        raise FileError(f"{path}: rows are of station {max(one.max(), two.max())}, of {stations} that are described")
+    if np.any(np.diff(time) < 0):
+        order = np.argsort(time, kind="stable")
+        numbers, time, one, two = (x[order] for x in (numbers, time, one, two))
+    begins = np.append(np.flatnonzero(np.diff(time, prepend=-np.inf) > SAME_S), len(time))
+    pairs = np.unique(np.minimum(one, two).astype(np.int64) * stations + np.maximum(one, two))
+    slots = time[begins[:-1]]
+    return Rows(numbers, begins, slots, np.zeros(len(slots)), pairs // stations, pairs % stations, 0)
+
+
+def places(path: str, rows: Rows, stations: int, times: slice, one: Int, two: Int) -> Int:
+    """Where each row of some times stands among the baselines; raises `FileError` for a baseline that is twice."""
+    low, high = np.minimum(one, two), np.maximum(one, two)
+    names = rows.antenna1 * stations + rows.antenna2
+    found = np.searchsorted(names, low * stations + high)
+    slot = np.repeat(np.arange(times.stop - times.start), np.diff(rows.begins[times.start : times.stop + 1]))
+    place = slot * len(names) + found
+    if len(np.unique(place)) < len(place):
+        twice = int(slot[np.flatnonzero(np.diff(np.sort(place)) == 0)[0]]) if len(place) else 0
+        raise FileError(f"{path}: a baseline has two rows at time {times.start + twice} of this window and field")
+    return np.asarray(place)
+
+
+def coordinates(path: str, frame: Frame, rows: Rows, times: slice, one: Int, two: Int, uvw: Float | None) -> Where:
+    """Coordinates of rows whose UVW (N, 3) are antenna 2 minus antenna 1; without them those of the IERS Earth."""
+    place, turned = places(path, rows, len(frame.layout), times, one, two), one > two
+    slots, centre = rows.slots_s[times], frame.centre
+    at = Sampling(
+        frame.layout, earth_frame(times_of(slots), frame.layout.centre_m), slots, frame.freq_hz,
+        np.array([centre.ra_rad]), np.array([centre.dec_rad]), centre,
+        steered=None if frame.pointing == centre else frame.pointing,
+    )  # fmt: skip
+    if uvw is None:
+        return Where(at, None, place, turned)
+    if not np.isfinite(uvw).all():
+        raise FileError(f"{path}: UVW is not finite, {times.stop - times.start} times from {times.start}")
+    ours = at.uvw_m[:, rows.antenna1] - at.uvw_m[:, rows.antenna2]
+    own, seen = ours.copy(), np.zeros(ours.shape[:2], bool)
+    own.reshape(-1, 3)[place] = np.where(turned[:, None], uvw, -uvw)  # station 1 minus station 2
+    seen.ravel()[place] = True
+    if not times.start:
+        _compare(path, own, ours)
+    stations = stations_seen(own, seen, rows.antenna1, rows.antenna2, at.uvw_m)
+    if stations is None:
+        return Where(at, own, place, turned)
+    return Where(replace(at, own_uvw_m=stations), None, place, turned)
+
+
+def _compare(path: str, own: Float, ours: Float) -> None:
+    """Warn where the UVW of the file are not those of its stations, times and phase centre."""
+    size = float(np.sqrt((ours**2).sum())) or 1.0
+    apart, turned = (float(np.sqrt(((own - sign * ours) ** 2).sum())) / size for sign in (1, -1))
+    if turned < FAR:
+        warn(f"{path}: UVW are of the other sign, antenna 1 minus 2: what is imaged or predicted is mirrored")
+    elif apart > FAR:
+        warn(
+            f"{path}: UVW are {100 * apart:.2g} % off those of its stations, times and phase centre: another "
+            "centre, equinox or date? They are used as they stand"
+        )
+
+
+def block_of(
+    frame: Frame, rows: Rows, times: slice, where: Where, data: Complex, flag: Bool, weight: Float, state: BeamState
+) -> Visibilities:
+    """The block of some times, of data, flags and weights (N, F, n) of its rows as the file has them."""
+    shape, turned = (times.stop - times.start, len(rows.antenna1)), where.turned
+
+    def grid(values: Any, lacking: Any) -> Any:
+        out = np.full((shape[0] * shape[1], *values.shape[1:]), lacking, values.dtype)
+        out[where.place] = values
+        return np.moveaxis(out.reshape(*shape, *values.shape[1:]), 1, 2)
+
+    data, flag, weight = frame.linear(data), frame.spread(flag, True), frame.spread(weight, 0.0)
+    if turned.any():
+        data[turned] = np.conj(np.swapaxes(data[turned], -1, -2))
+        flag, weight = np.array(flag), np.array(weight)
+        for x in (flag, weight):
+            x[turned] = np.swapaxes(x[turned], -1, -2)
+    return Visibilities(
+        data=grid(data, 0.0), at=where.at, antenna1=rows.antenna1, antenna2=rows.antenna2,
+        interval_s=rows.interval_s[times], width_hz=frame.width_hz, weight=short(grid(weight, 0.0)),
+        flag=short(grid(flag, True)), beam_state=state, given_uvw_m=where.given_uvw_m,
+    )  # fmt: skip
+
+
+def short(values: Any) -> Any:
+    """Values of correlations (T, F, B, 2, 2) as (T, F, B) where all four are alike."""
+    first = values[..., 0, 0]
+    return first.copy() if np.all(values == first[..., None, None]) else values
