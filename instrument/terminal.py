@@ -17,6 +17,7 @@ from instrument.errors import InputError, InstrumentError, InstrumentWarning
 
 DONE, FAILED, BAD_INPUT, FELL_SHORT = 0, 1, 2, 3
 LEAST_ADDRESSES = 1.5e9  # bytes of `ulimit -v` below which LLVM and BLAS abort while they are loaded
+finished: list[str] = []  # what this process has done that stays, also where it is stopped after it
 _lost: list[OSError] = []  # why standard output takes nothing more
 
 
@@ -56,8 +57,8 @@ def status_of(work: Callable[[], int]) -> int:
         return BAD_INPUT
     except InstrumentError as error:
         say(str(error))
-    except KeyboardInterrupt as error:
-        say("stopped; " + ("; ".join(getattr(error, "__notes__", ())) or "nothing was written"))
+    except KeyboardInterrupt:
+        _say_stopped()
     except MemoryError as error:
         say(
             f"not enough memory ({error or 'refused by the system'}): ask for fewer sources, depths, channels or pixels"
@@ -86,7 +87,13 @@ def process(work: Callable[[], int]) -> int:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is not signal.SIG_IGN:  # nohup
             signal.signal(number, _stop)
-    status = status_of(lambda: _within_limits(work))
+    finished.clear()
+    try:
+        status = status_of(lambda: _within_limits(work))
+        _from_now_on_nothing_stops_it()
+    except KeyboardInterrupt:  # as the work had ended: it is raised once, so what follows is not stopped
+        _say_stopped()
+        status = FAILED
     try:
         if not _lost:
             sys.stdout.flush()
@@ -118,9 +125,17 @@ def _within_limits(work: Callable[[], int]) -> int:
 
 def _stop(number: int, frame: FrameType | None) -> None:
     """Ends the work once; what comes while it is being cleaned up changes nothing."""
-    for other in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(other, signal.SIG_IGN)
+    _from_now_on_nothing_stops_it()
     raise KeyboardInterrupt
+
+
+def _from_now_on_nothing_stops_it() -> None:
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+
+
+def _say_stopped() -> None:
+    say("stopped; " + ("; ".join(finished) or "nothing was written"))
 
 
 def _open_streams() -> None:

@@ -2,8 +2,9 @@
 
     python docs/reports/fuzz.py [COUNT] [SEED] [--dry]
 
-Every case is a forked process with limits (20 s of CPU, more on a slower machine; 2 GB). It must be done and whole, or
-refused in one line with nothing left behind. `--dry` prints the faults alone and writes nothing.
+Every case is a forked process with limits (20 s of CPU, or twice those of a healthy scene with all figures; 2 GB). It
+must be done and whole, or refused in one line with nothing left behind. `--dry` prints the faults alone and writes
+nothing.
 """
 
 import platform

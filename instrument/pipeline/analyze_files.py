@@ -19,6 +19,7 @@ from instrument.files.number_list import read_frequencies, read_numbers
 from instrument.image.channels import channel_numbers, in_band
 from instrument.image.cube import StokesCube
 from instrument.image.psf import Psf
+from instrument.memory import quick_give_back
 from instrument.pipeline.folder import RunFolder
 from instrument.pipeline.progress import progress_bar
 from instrument.pipeline.record import costs, json_text, spent, versions
@@ -166,6 +167,7 @@ def _beam(text: str, cube: StokesCube) -> Psf:
     return psf
 
 
+@quick_give_back()
 def _write(result: CubeResults, paths: Sequence[str], command: str, folder: Path, ledger: dict[str, list[str]]) -> None:
     from instrument.report.page import write_page
     from instrument.report.run_page import page_of_run

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from instrument.errors import InputError, warn
+from instrument.terminal import finished
 
 MOST_BYTES = 200e6  # of a record
 PARTIAL = ".instrument-partial"  # ends the names of folders that are being written
@@ -56,7 +57,7 @@ class RunFolder:
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if error is not None and not self.partial.exists() and self.path.exists():
-            error.add_note(f"{self.path} is written")  # stopped after the move
+            self._is_written()  # stopped after the move
         shutil.rmtree(self.partial, ignore_errors=True)
         for folder in self._made:  # made for a run that left nothing in them
             with contextlib.suppress(OSError):
@@ -80,6 +81,7 @@ class RunFolder:
             except OSError:
                 old.rename(asked)
                 raise
+            self._is_written()
             shutil.rmtree(old, ignore_errors=True)
             return asked
         while True:
@@ -90,9 +92,15 @@ class RunFolder:
                 if error.errno not in TAKEN:
                     raise
                 self.path = _next_free(asked)
+        self._is_written()
         if self.path != asked:
             warn(f"{asked} was taken meanwhile: the results are in {self.path}")
         return self.path
+
+    def _is_written(self) -> None:
+        """From here on a stopped program says so."""
+        if (said := f"{self.path} is written") not in finished:
+            finished.append(said)
 
     def _replaces(self, folder: Path) -> bool:
         """Whether an earlier run folder is there that may go."""

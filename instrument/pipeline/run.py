@@ -10,7 +10,7 @@ from typing import Any
 
 from instrument.errors import unused_ledger
 from instrument.jones.chain import Chain
-from instrument.memory import give_back
+from instrument.memory import give_back, quick_give_back
 from instrument.pipeline.folder import RunFolder
 from instrument.pipeline.on_curve import on_curve
 from instrument.pipeline.planning import plan_run
@@ -152,6 +152,7 @@ def stream(
         passing += share(name)
 
 
+@quick_give_back()
 def _write(result: Result, tables: dict[str, Any], folder: Path) -> None:
     """Everything of the run folder: scene, what the stages write, run.json, figures, report."""
     from instrument.report.page import write_page

@@ -155,3 +155,43 @@ def test_i2_no_module_of_the_working_directory_is_imported(tmp_path):
     )
     assert done.returncode == 0 and "hamaker" in done.stdout and "evil" not in done.stdout
     assert not (tmp_path / "ran").exists()
+
+
+STOPPED = """
+import os, signal, sys
+from instrument import terminal
+from instrument.pipeline.folder import RunFolder
+
+def stop():
+    os.kill(os.getpid(), signal.SIGTERM)
+
+def work():
+    with RunFolder("x", "o") as folder:
+        (folder.partial / "run.json").write_text("{}")
+        if WHEN == "within":
+            stop()
+        folder.finish()
+    if WHEN == "after":
+        stop()
+    return 0
+
+WHEN = sys.argv[1]
+if WHEN == "ended":  # as its last line is being taken back
+    ended = terminal.status_of
+    terminal.status_of = lambda work: (ended(work), stop())[0]
+sys.exit(terminal.process(work))
+"""
+
+
+@pytest.mark.parametrize(
+    ("when", "line"),
+    [
+        ("within", "stopped; nothing was written"),
+        ("after", "stopped; o is written"),
+        ("ended", "stopped; o is written"),
+    ],
+)
+def test_g6_a_run_stopped_once_its_folder_is_there_says_that_it_is_written(tmp_path, when, line):
+    done = subprocess.run([sys.executable, "-c", STOPPED, when], cwd=tmp_path, capture_output=True, text=True)
+    assert done.stderr == f"instrument: {line}\n" and done.returncode == 1
+    assert (tmp_path / "o").exists() == (when != "within")

@@ -13,11 +13,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from instrument.machine import measured
+from fuzzing.seeds import WHOLE
 
 ZYGOTE = Path(__file__).with_name("zygote.py")
-# a full analysis with its figures takes 10 s of CPU; wall time is generous: that is no hang. CPU_S are seconds of the
-# machine of all costs (`instrument.machine`): one that is slower, or shared, has as many more
+# wall time is generous: that is no hang. Where a case took CPU_S, it gets twice what healthy work takes at that time
 CPU_S, WALL_S, MEMORY, MORE = 20, 180, 2e9, 1.6e9
 GOOD = ("done", "refused", "long")
 ANNOUNCED = re.compile(r"^engine .* about (?:(\d+) s|\d+ min)", re.M)
@@ -66,8 +65,6 @@ class Zygote:
     def __init__(self, warm: list[list[str]], folder: Path) -> None:
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
-        # now, and not as it was found once: other work beside this makes a second of CPU do less
-        self.cpu_s = CPU_S / min(1.0, measured())
         words = [sys.executable, str(ZYGOTE), json.dumps(warm)]
         self._process = subprocess.Popen(
             words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder
@@ -85,7 +82,7 @@ class Zygote:
         for stream in (self._process.stdout, self._process.stderr):
             stream.close()
 
-    def ask(self, case: Case, folder: Path) -> dict:
+    def ask(self, case: Case, folder: Path, cpu_s: float = CPU_S) -> dict:
         """Run a case in a folder; the answer of the process, with what it wrote on its streams."""
         out, err = (folder.with_name(f"{folder.name}.{name}") for name in ("out", "err"))
         asked = {
@@ -95,7 +92,7 @@ class Zygote:
             "cwd": str(folder),
             "out": str(out),
             "err": str(err),
-            "cpu_s": self.cpu_s,
+            "cpu_s": cpu_s,
             "wall_s": WALL_S,
             "memory": MEMORY,
             "more": MORE,
@@ -109,18 +106,33 @@ class Zygote:
         return answer
 
     def judge(self, case: Case) -> Verdict:
-        """What comes of a case; a hang is tried twice, for the first may have compiled what the second finds."""
-        found = self._judged(case)
-        return self._judged(case) if found.verdict == "FAULT hang" else found
+        """What comes of a case; a hang is tried twice, for the first may have compiled what the second finds.
 
-    def _judged(self, case: Case) -> Verdict:
+        The second time it has twice the processor time of a small scene with all that can be drawn of it, measured
+        then: other work on the machine, or a slow one, makes a second do less.
+        """
+        found = self._judged(case)
+        return self._judged(case, max(CPU_S, 2 * self.healthy_s())) if found.verdict == "FAULT hang" else found
+
+    def healthy_s(self) -> float:
+        """Processor seconds of the small scene with all figures, now."""
+        folder = self.folder / "healthy"
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        (folder / "s.toml").write_text(WHOLE)
+        answer = self.ask(Case("whole", "healthy", lambda _: None, ("run", "s.toml", "--out", "o")), folder, WALL_S)
+        if answer["status"] != 0:
+            raise RuntimeError(f"the healthy scene was not done: {answer}")
+        return answer["cpu_s"]
+
+    def _judged(self, case: Case, cpu_s: float = CPU_S) -> Verdict:
         """Make the files of a case, run it, and say what came of it; the folder is removed when that is good."""
         folder = self.folder / "case"
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir()
         case.setup(folder)
         before = snapshot(folder)
-        answer = self.ask(case, folder)
+        answer = self.ask(case, folder, cpu_s)
         after = snapshot(folder)
         new = tuple(sorted(after.keys() - before.keys()))
         changed = sorted(k for k in before if after.get(k) != before[k])

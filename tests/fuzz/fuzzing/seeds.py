@@ -44,6 +44,7 @@ CUBES = IMAGES.replace("channels = 1", "channels = 4").replace(
     'products = ["leakage", "spectrum-2d"]\n',
     'products = []\n\n[analyze.cube]\nproducts = ["faraday", "cylindrical"]\ndepths = [-5, 5, 1]\nbins = 4\n',
 )
+WHOLE = CUBES.replace('["faraday", "cylindrical"]', "[]")  # all that can be drawn of it
 _PERFECT = SCENE.replace('[correct]\nbeam = "centre"\n\n', "")
 SELFCAL = _PERFECT.replace("[noise]", '[calibrate]\nkind = "selfcal"\n\n[noise]').replace(
     "gain = { rms = 1e-3 }", 'beam = "none"\ngain = { rms = 1e-3 }\nfeed = { rms = 1e-3 }'
