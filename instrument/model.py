@@ -84,6 +84,7 @@ class Instrument(Component):
     """
 
     plugin_kind: ClassVar[str | None] = "telescopes"
+    telescope_name: ClassVar[str] = ""  # as Measurement Sets have it
     terms_enter: ClassVar[bool] = True  # False where `terms` are the chain itself
     gain: GainTerm | None = None
     feed: FeedTerm | None = None

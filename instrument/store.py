@@ -36,6 +36,7 @@ PER_TIME = (
     "slots_s", "earth_matrices", "earth_velocity", "seen", "seen_east", "seen_centre", "given_uvw_m", "own_uvw_m",
 )  # fmt: skip
 SPREAD = {"weight": (0, 1), "flag": (0, 1), "interval_s": (0,), "width_hz": (1,)}  # axes along which one may do for all
+LARGE = ("data", *PER_TIME[3:], "weight", "flag")  # read a part at a time
 FIXED = ("antenna1", "antenna2", "ra_rad", "dec_rad", "centre", "layout", "beam_state")
 KINDS = {"data": "c", "flag": "b", "antenna1": "iu", "antenna2": "iu", "layout": "u", "beam_state": "u"}
 
@@ -215,7 +216,7 @@ class Store:
         with h5.opened(path, WHAT) as file:
             sets = self._sets(file)
             self.shape = sets["data"].shape[:3]
-            small = {n: np.asarray(d[()]) for n, d in sets.items() if n not in ("data", *PER_TIME[3:], *SPREAD)}
+            small = {n: np.asarray(d[()]) for n, d in sets.items() if n not in LARGE}
             self.written = {str(k): h5.text(v) for k, v in file.attrs.items()}
         texts = {name: small[name].astype(np.uint8).tobytes().decode("utf-8", "replace") for name in FIXED[-2:]}
         self.slots_s, self.freq_hz = small["slots_s"], small["freq_hz"]

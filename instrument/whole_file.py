@@ -41,6 +41,45 @@ def whole_file(path: str | os.PathLike[str], overwrite: bool = False) -> Iterato
             shutil.rmtree(private, ignore_errors=True)
 
 
+@contextmanager
+def whole_folder(path: str | os.PathLike[str], mark: str, overwrite: bool = False) -> Iterator[Path]:
+    """The same for what is a folder of its own: with `overwrite` one that has the file `mark` in it is replaced.
+
+    The old one is there until the new one is whole.
+    """
+    target = Path(path)
+    private: Path | None = None
+    _free_folder(target, mark, overwrite)
+    try:
+        private = Path(tempfile.mkdtemp(prefix=".partial-", dir=target.parent))
+        yield private / target.name
+        _free_folder(target, mark, overwrite)
+        if target.is_dir():
+            old = target.rename(private / "old")
+            try:
+                (private / target.name).rename(target)
+            except OSError:
+                old.rename(target)
+                raise
+        else:
+            (private / target.name).rename(target)
+    except OSError as error:
+        why = error.strerror or str(error).partition("\n")[0] or type(error).__name__
+        raise FileError(f"{path} cannot be written: {why}") from None
+    finally:
+        if private is not None:
+            shutil.rmtree(private, ignore_errors=True)
+
+
+def _free_folder(target: Path, mark: str, overwrite: bool) -> None:
+    if not os.path.lexists(target):
+        return
+    if target.is_symlink() or not (target / mark).is_file():
+        raise InputError(f"{target} exists and is something else: choose another name")
+    if not overwrite:
+        raise InputError(f"{target} exists: give overwrite=True, or another name")
+
+
 def _free(target: Path, overwrite: bool) -> None:
     if os.path.lexists(target) and (not overwrite or (target.is_dir() and not target.is_symlink())):
         remedy = "choose another name" if target.is_dir() else "give overwrite=True, or another name"

@@ -7,21 +7,24 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 from instrument.checked import checked
 from instrument.errors import FileError, InputError, warn
+from instrument.files import ms_create
 from instrument.files.by_rows import SAME_S, Where, block_of, coordinates, places
 from instrument.files.ms_frame import beam_state_of, beam_words, frame_of
 from instrument.files.ms_rows import add_column, at_rows, filled, in_parts, put_rows, rows_of
 from instrument.files.ms_tables import demand, opened, told
+from instrument.model import Instrument
 from instrument.observe.recorded import Recorded
 from instrument.store import Store
 from instrument.units import Float, Int
 from instrument.visibilities import Visibilities, VisibilitySet
 from instrument.visibility_sets import BLOCK_BYTES, VisibilityFile, as_set
+from instrument.whole_file import whole_folder
 
 SAME_RAD = 1e-9  # phase centres as near as this are one
 NEEDED = ("TIME", "INTERVAL", "ANTENNA1", "ANTENNA2", "DATA_DESC_ID", "FIELD_ID", "UVW", "FLAG")
@@ -124,6 +127,32 @@ class MeasurementSet(VisibilitySet):
                     self._put(table, column, block)
                 with told(f"column {column}"):
                     table.putcolkeywords(column, beam_words(store.beam_state))
+
+    @classmethod
+    def create(
+        cls,
+        path: str | os.PathLike[str],
+        blocks: VisibilitySet | Iterable[Visibilities],
+        overwrite: bool = False,
+        instrument: Instrument | None = None,
+    ) -> Self:
+        """Write blocks as a new set, which DP3, EveryBeam, WSClean and CASA read; the set.
+
+        Data go to DATA in single precision, weights to WEIGHT_SPECTRUM, their means to WEIGHT, 1/sqrt of those to
+        SIGMA; UVW are those of the blocks, antenna 2 minus antenna 1. With the `instrument` the telescope has its name,
+        and a LOFAR its tables of stations, tiles and dipoles, without which no other program finds its beam. The set is
+        whole or not there; one that is there is replaced with `overwrite` only. Raises `InputError` for other folders
+        of that name, `FileError` where nothing can be written.
+        """
+        with whole_folder(path, "table.dat", overwrite) as partial:
+            kept = blocks if isinstance(blocks, VisibilityFile) else None
+            if kept is None:
+                as_set(blocks).save(partial.with_suffix(".h5"))
+                kept = VisibilityFile(partial.with_suffix(".h5"))
+            ms_create.make(str(partial), kept.store, instrument)
+            for block in kept.blocks():
+                ms_create.put(str(partial), block, kept.store)
+        return cls(path)
 
     def _known(self, table: Any) -> None:
         if self.column not in table.columns():

@@ -19,10 +19,7 @@ MISSING = "Measurement Sets need arcae (Linux, macOS): pip install 'instrument[m
 @contextmanager
 def opened(path: str | os.PathLike[str], sub: str = "", writable: bool = False) -> Iterator[Any]:
     """A table of the set, closed at the end; `FileError` for what is none, is locked, or cannot be read here."""
-    try:
-        from arcae.lib.arrow_tables import Table
-    except ImportError:
-        raise InputError(MISSING) from None
+    Table = _library()
     name = str(path)
     if not Path(name).exists():
         raise FileError(f"{name}: there is no such Measurement Set")
@@ -34,6 +31,37 @@ def opened(path: str | os.PathLike[str], sub: str = "", writable: bool = False) 
         yield table
     finally:
         table.close()
+
+
+@contextmanager
+def created(path: str, columns: dict[str, Any], tile: list[int] | None = None) -> Iterator[Any]:
+    """A new table with columns as casacore describes them: a set with those a set must have, if `tile` is given.
+
+    `tile` is the shape of the tiles of its cubes (correlations, channels, rows).
+    """
+    Table = _library()
+    groups = {
+        f"*{k}": {"NAME": c["dataManagerGroup"], "TYPE": c["dataManagerType"], "SPEC": {"DEFAULTTILESHAPE": tile},
+                  "COLUMNS": [name]}
+        for k, (name, c) in enumerate(columns.items(), 1) if tile
+    }  # fmt: skip
+    with told(path):
+        if tile:
+            table = Table.ms_from_descriptor(path, "MAIN", columns, groups)
+        else:
+            table = Table.from_descriptor(path, table_desc=columns)
+    try:
+        yield table
+    finally:
+        table.close()
+
+
+def _library() -> Any:
+    try:
+        from arcae.lib.arrow_tables import Table
+    except ImportError:
+        raise InputError(MISSING) from None
+    return Table
 
 
 @contextmanager

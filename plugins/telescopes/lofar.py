@@ -27,6 +27,7 @@ AXES = ("px", "py", "pz", "qx", "qy", "qz", "rx", "ry", "rz")
 class _Lofar(Instrument):
     """What the two bands share: stations by name from a table, the beam and where it points."""
 
+    telescope_name = "LOFAR"
     station_file: ClassVar[str]
     parts_file: ClassVar[str]
 
