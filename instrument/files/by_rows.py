@@ -61,7 +61,7 @@ def in_time(numbers: Int, time: Float, one: Int, two: Int, stations: int, path: 
         raise FileError(f"{path}: rows are of station {max(one.max(), two.max())}, of {stations} that are described")
     if np.any(np.diff(time) < 0):
         order = np.argsort(time, kind="stable")
-        numbers, time, one, two = (x[order] for x in (numbers, time, one, two))
+        numbers, time, one, two = numbers[order], time[order], one[order], two[order]
     begins = np.append(np.flatnonzero(np.diff(time, prepend=-np.inf) > SAME_S), len(time))
     pairs = np.unique(np.minimum(one, two).astype(np.int64) * stations + np.maximum(one, two))
     slots = time[begins[:-1]]

@@ -43,7 +43,7 @@ def rows_of(table: Any, frame: Frame, path: str) -> Rows:
     numbers = np.flatnonzero(mine & (one != two))
     if not len(numbers):
         raise FileError(f"{path} has no cross-correlations of this window and field")
-    found = in_time(numbers, *(x[numbers] for x in (time, one, two)), len(frame.layout), path)
+    found = in_time(numbers, time[numbers], one[numbers], two[numbers], len(frame.layout), path)
     interval = at_rows(table, "INTERVAL", found.numbers[found.begins[:-1]])
     return found._replace(interval_s=interval, autos=autos)
 
