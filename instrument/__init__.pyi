@@ -35,6 +35,8 @@ from .files.measurement_set import MeasurementSet as MeasurementSet
 from .files.number_list import read_frequencies as read_frequencies
 from .files.solutions import read_h5parm as read_h5parm
 from .files.solutions import write_h5parm as write_h5parm
+from .files.uv_file import UVFile as UVFile
+from .files.uv_write import write_uv as write_uv
 from .foreground.base import ForegroundRemover as ForegroundRemover
 from .foreground.base import Split as Split
 from .foreground.loss import SignalLoss as SignalLoss

@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from instrument.beam_state import BeamState
-from instrument.errors import FileError, warn
+from instrument.errors import FileError, InputError, warn
 from instrument.files.ms_frame import Frame
 from instrument.observe.closure import stations_seen
 from instrument.observe.directions import earth_frame
+from instrument.observe.recorded import Recorded
 from instrument.observe.sampling import Sampling, times_of
 from instrument.units import Bool, Complex, Float, Int
 from instrument.visibilities import Visibilities
@@ -141,6 +142,20 @@ def block_of(
         interval_s=rows.interval_s[times], width_hz=frame.width_hz, weight=short(grid(weight, 0.0)),
         flag=short(grid(flag, True)), beam_state=state, given_uvw_m=where.given_uvw_m,
     )  # fmt: skip
+
+
+def recorded(path: str, frame: Frame, rows: Rows, parts: list[Where]) -> Recorded:
+    """The observation of a file, of the coordinates of all its times; raises `InputError` where it is none to predict.
+
+    That is where the UVW are not those of stations, or integrations are not equally long.
+    """
+    if any(part.given_uvw_m is not None for part in parts):
+        raise InputError(f"{path}: its UVW do not close around triangles of stations: nothing is predicted")
+    if np.ptp(rows.interval_s) > SAME_S:
+        raise InputError(f"{path}: integrations of {rows.interval_s.min():g} to {rows.interval_s.max():g} s")
+    own, width = np.concatenate([part.at.uvw_m for part in parts]), frame.width_hz
+    at = replace(parts[0].at, slots_s=rows.slots_s, own_uvw_m=own)
+    return Recorded.of(at, float(rows.interval_s[0]), float(width[0]) if np.ptp(width) == 0 else None)
 
 
 def short(values: Any) -> Any:

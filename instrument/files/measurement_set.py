@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,7 +13,7 @@ import numpy as np
 from instrument.checked import checked
 from instrument.errors import FileError, InputError, warn
 from instrument.files import ms_create
-from instrument.files.by_rows import SAME_S, Where, block_of, coordinates, places
+from instrument.files.by_rows import SAME_S, Where, block_of, coordinates, places, recorded
 from instrument.files.ms_frame import beam_state_of, beam_words, frame_of
 from instrument.files.ms_rows import add_column, at_rows, filled, in_parts, put_rows, rows_of
 from instrument.files.ms_tables import demand, opened, told
@@ -81,16 +80,9 @@ class MeasurementSet(VisibilitySet):
 
         Raises `InputError` where the UVW are not those of stations, or integrations are not equally long.
         """
-        rows = self.rows
         with opened(self.path) as table:
             parts = [self._coordinates(table, times) for times in self._steps()]
-        if any(part.given_uvw_m is not None for part in parts):
-            raise InputError(f"{self.path}: its UVW do not close around triangles of stations: nothing is predicted")
-        if np.ptp(rows.interval_s) > SAME_S:
-            raise InputError(f"{self.path}: integrations of {rows.interval_s.min():g} to {rows.interval_s.max():g} s")
-        own, width = np.concatenate([part.at.uvw_m for part in parts]), self.frame.width_hz
-        at = replace(parts[0].at, slots_s=rows.slots_s, own_uvw_m=own)
-        return Recorded.of(at, float(rows.interval_s[0]), float(width[0]) if np.ptp(width) == 0 else None)
+        return recorded(self.path, self.frame, self.rows, parts)
 
     def blocks(self) -> Iterator[Visibilities]:
         """Blocks in order of time, all channels each."""

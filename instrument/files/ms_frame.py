@@ -76,11 +76,11 @@ def frame_of(path: str, window: int | None, field: int | None, described: Int, f
     if described.size and described.max() >= len(windows):
         raise FileError(f"{path}: rows have DATA_DESC_ID {described.max()}, of {len(windows)} that are described")
     have = sorted({int(windows[d]) for d in described})
-    chosen = _one(path, window, have, "window", "spectral windows")
+    chosen = one_of(path, window, have, "window", "spectral windows")
     rows = [int(d) for d in described if windows[d] == chosen]
     if len(rows) > 1:
         raise FileError(f"{path}: spectral window {chosen} has {len(rows)} sets of correlations: split the set")
-    which = _one(path, field, [int(f) for f in fields], "field", "fields")
+    which = one_of(path, field, [int(f) for f in fields], "field", "fields")
     freq, width, backwards = _channels(path, chosen)
     centre, pointing = _directions(path, which)
     layout, telescope = _stations(path)
@@ -90,7 +90,8 @@ def frame_of(path: str, window: int | None, field: int | None, described: Int, f
     )  # fmt: skip
 
 
-def _one(path: str, asked: int | None, have: list[int], name: str, what: str) -> int:
+def one_of(path: str, asked: int | None, have: list[int], name: str, what: str) -> int:
+    """The window or field asked for, or the only one; raises `InputError` where one is to be chosen."""
     if asked is None and len(have) == 1:
         return have[0]
     if asked in have:
@@ -117,7 +118,11 @@ def _channels(path: str, window: int) -> tuple[Float, Float, bool]:
 
 def _correlations(path: str, row: int) -> tuple[int, ...]:
     with opened(path, "POLARIZATION") as table:
-        kinds = tuple(int(k) for k in column(table, "CORR_TYPE", slice(row, row + 1))[0])
+        return correlated(path, tuple(int(k) for k in column(table, "CORR_TYPE", slice(row, row + 1))[0]))
+
+
+def correlated(path: str, kinds: tuple[int, ...]) -> tuple[int, ...]:
+    """Correlations as casacore numbers them; raises `InputError` for those that no 2 x 2 matrices can be made of."""
     for known in (LINEAR, CIRCULAR):
         if set(kinds) <= set(known) and {known[0], known[3]} <= set(kinds) and len(set(kinds)) == len(kinds):
             if known is CIRCULAR and len(kinds) < 4:
@@ -157,8 +162,7 @@ def _stations(path: str) -> tuple[Layout, str]:
     with opened(path, "OBSERVATION") as table:
         known = "TELESCOPE_NAME" in table.columns() and table.nrow()
         telescope = str(column(table, "TELESCOPE_NAME", slice(0, 1))[0]) if known else ""
-    twice = {n for n in names if names.count(n) > 1}
-    names = [f"{n}-{k}" if n in twice or not n else n for k, n in enumerate(names)]
+    names = distinct(names)
     with opened(path) as table:
         fields = "LOFAR_ANTENNA_FIELD" in table.getkeywords()
     if not fields:
@@ -170,6 +174,12 @@ def _stations(path: str) -> tuple[Layout, str]:
     if -1 in first:
         raise FileError(f"{path}: station '{names[first.index(-1)]}' has no row in LOFAR_ANTENNA_FIELD")
     return Layout(names=tuple(names), positions_m=places, axes=axes[first]), telescope
+
+
+def distinct(names: list[str]) -> list[str]:
+    """Names of stations, with their numbers where there are several of one name or none."""
+    twice = {n for n in names if names.count(n) > 1}
+    return [f"{n}-{k}" if n in twice or not n else n for k, n in enumerate(names)]
 
 
 def beam_state_of(words: dict[str, Any], path: str) -> BeamState:

@@ -180,6 +180,9 @@ def calls():
             "path": "none.h5", "times": slice(0, 1), "channels": slice(0, 1)}),
         ("VisibilityFile", ins.VisibilityFile, {"path": "none.h5"}),
         ("MeasurementSet", ins.MeasurementSet, {"path": "none.MS", "column": "DATA", "window": 0, "field": 0}),
+        ("UVFile", ins.UVFile, {"path": "none.uvh5", "window": 0, "field": 0, "centre": "0h 0d"}),
+        ("write_uv", ins.write_uv, {
+            "path": "none/v.uvh5", "visibilities": w.vis, "overwrite": True, "precision": "single", "telescope": "X"}),
         ("Visibilities.without_beam", w.vis.without_beam, {"instrument": w.instrument}),
         ("JonesTable.jones", w.solution.term.jones, {"at": w.at}),
         ("SelfCal.solve", ins.SelfCal().solve, {"data": w.vis, "model": w.vis}),
