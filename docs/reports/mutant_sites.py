@@ -29,8 +29,8 @@ GROUPS = {
 # files and words, refusals, bounds, threads: no formula stands there
 NOT_NUMERICAL = (
     "*/__init__.py", "*/sky/bbs*.py", "*/sky/*tables.py", "*/sky/columns.py", "*/sky/foreign.py", "*/sky/readers.py",
-    "*/sky/forms.py", "*/sky/doubts.py", "*/sky/rounding.py", "*/image/cube_file.py", "*/faraday/file.py",
-    "*/cube_checks.py", "*/calibrate/reasons.py", "*/predict/rounding.py", "*/predict/threads.py",
+    "*/sky/ao_text.py", "*/sky/forms.py", "*/sky/doubts.py", "*/sky/rounding.py", "*/image/cube_file.py",
+    "*/faraday/file.py", "*/cube_checks.py", "*/calibrate/reasons.py", "*/predict/rounding.py", "*/predict/threads.py",
 )  # fmt: skip
 KINDS = ("operator", "sign", "conjugate", "index", "number")
 BOUNDS_AND_COSTS = {"rounding", "peak", "jump", "work", "phasors", "bound", "bytes", "memory", "cost", "items"}

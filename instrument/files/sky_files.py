@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, PrivateAttr, model_validator
 
-from instrument.errors import FileError, InputError, unused
+from instrument.errors import FileError, InputError, unused, warn
 from instrument.files.fits import NAMES, read_cube
 from instrument.files.fits_open import opened
 from instrument.files_in import harmless
@@ -147,6 +147,8 @@ class HealpixFile(_FileSky):
         nested = _one_of(name, header, "ORDERING", {"RING": False, "NESTED": True, "NEST": True}, None)
         frame = self.coordinates or _one_of(name, header, "COORDSYS", FRAMES, "coordinates")
         convention = self.convention or _one_of(name, header, "POLCCONV", CONVENTIONS, "convention", "COSMO")
+        if len(maps) > 1 and self.convention is None and "POLCCONV" not in header:
+            warn(f"{name}: no POLCCONV in its header: U is taken as COSMO; convention = 'IAU' takes it as the IAU's")
         planes, open_ = on_grid(maps, grid, nested, frame, convention)
         scale = _per_sr(name, self.unit or str(header.get("TUNIT1", "")).strip(), freq)
         text = f"{name}, nside {healpix_of(maps.shape[1], nested).nside}, {frame}, {convention}: between its pixels "

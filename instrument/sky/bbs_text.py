@@ -6,12 +6,14 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
-from instrument.errors import FileError, did_you_mean, unused
+from instrument.errors import FileError, InputError, did_you_mean, unused
 from instrument.files_in import harmless
 
+M = TypeVar("M")
 FIELDS = (
     "Name", "Type", "Patch", "Ra", "Dec", "I", "Q", "U", "V", "MajorAxis", "MinorAxis", "Orientation",
     "OrientationIsAbsolute", "ReferenceFrequency", "SpectralIndex", "LogarithmicSI", "RotationMeasure",
@@ -34,6 +36,14 @@ def broken(path: Path, line: int | None, message: str, kind: str = "line") -> Fi
     """The one-line error of a file: its name, the line or row, what is wrong and the remedy."""
     where = f", {kind} {line}" if line is not None else ""
     return FileError(f"{harmless(path.name)}{where}: {harmless(message, 600)}")
+
+
+def made(make: type[M], path: Path, **fields: Any) -> M:
+    """What a file makes, a `make` of these fields; what is impossible in it is a `FileError` of the file."""
+    try:
+        return make(**fields)
+    except InputError as error:
+        raise broken(path, None, str(error)) from None
 
 
 @dataclass(frozen=True)

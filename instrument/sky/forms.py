@@ -16,7 +16,9 @@ from instrument.files_in import GZIP, harmless, read_regular
 from instrument.sky.bbs import read_bbs
 from instrument.sky.bbs_text import broken, is_bbs
 from instrument.sky.binary_tables import fits_table, votable
-from instrument.sky.foreign import read_oskar, refuse_foreign
+from instrument.sky.foreign import refuse_foreign
+from instrument.sky.programs import program_of
+from instrument.sky.skyh5 import HDF5, read_skyh5
 from instrument.sky.sources import Sources
 from instrument.sky.table_sky import Choices, Incomplete, Sizes, sky_of
 from instrument.sky.text_tables import text_table
@@ -62,14 +64,14 @@ def read_as(
 ) -> S:
     """Sources, as a list of the class `make`, of a file on disk, or of one of the package ("3c196_pandey.skymodel").
 
-    BBS text, an OSKAR model (.osm), or a table as CSV, ECSV, FITS or VOTable, also packed by gzip; which one is told
-    from the content. A table needs positions and a flux; the names and units that are understood, and the surveys that
-    are known by their columns, stand in docs/skies.md. Columns that are not read are named in a warning and in the
-    plan. What a table leaves open is asked for: `sizes` = "points" or "as given" and `beam` (its FWHM) where there are
-    only sizes fitted to an image, `frequency` of the fluxes, and `incomplete` = "leave out" or "no effect" for sources
-    that lack a value (also -999 and the like); the usual "refuse" tells the first of them. `centre` (SkyCoord or text)
-    is the phase centre that BBS files may count orientations from; see `read_bbs` for what is done without it. Raises
-    `FileError` with file, line, field and remedy.
+    BBS text, a model of SAGECal, OSKAR (.osm), Tigger or mwa-reduce (AO), a SkyH5 file, or a table as CSV, ECSV, FITS
+    or VOTable, also packed by gzip (but SkyH5); which one is told from the content. A table needs positions and a flux;
+    the names and units that are understood, and the surveys that are known by their columns, stand in docs/skies.md.
+    Columns that are not read are named in a warning and in the plan. What a table leaves open is asked for: `sizes` =
+    "points" or "as given" and `beam` (its FWHM) where there are only sizes fitted to an image, `frequency` of the
+    fluxes, and `incomplete` = "leave out" or "no effect" for sources that lack a value (also -999 and the like); the
+    usual "refuse" tells the first of them. `centre` (SkyCoord or text) is the phase centre that BBS files may count
+    orientations from; see `read_bbs` for what is done without it. Raises `FileError` with file, line, field and remedy.
     """
     told = _Reading(centre=centre, sizes=sizes, beam=beam, frequency=frequency, incomplete=incomplete)
     choices = Choices(told.sizes, told.beam, told.frequency, told.incomplete)
@@ -77,6 +79,8 @@ def read_as(
     raw = read_regular(file, CATALOGUE_BYTES, "catalogue", unzip=True)
     if raw.startswith(GZIP):
         raise broken(file, None, "gzip within gzip; unpack it")
+    if raw.startswith(HDF5):
+        return read_skyh5(make, file, choices.freq_hz)
     start = raw[:1024].lstrip(b"\xef\xbb\xbf").lstrip()
     if start.startswith(b"SIMPLE"):
         return sky_of(make, fits_table(file, raw), choices)
@@ -85,9 +89,10 @@ def read_as(
     name = file.name.lower().removesuffix(".gz")
     of_bbs = is_bbs(_head(raw))
     if not of_bbs:
+        if (program := program_of(name, _head(raw))) is not None:
+            read: S = program(make, file, _lines(file, raw))
+            return read
         refuse_foreign(file, raw)
-    if name.endswith(".osm"):
-        return read_oskar(make, file, raw)
     if b"\0" not in raw[:4096] and (name.endswith(BBS_SUFFIXES) or of_bbs):
         return read_bbs(make, file, _lines(file, raw), told.centre)
     return sky_of(make, text_table(file, raw), choices)

@@ -7,9 +7,8 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from instrument.errors import InputError
 from instrument.files_in import SHOWN, harmless
-from instrument.sky.bbs_text import broken
+from instrument.sky.bbs_text import broken, made
 from instrument.sky.columns import FITTED_BESIDE, KEPT, MEANINGS, bare, default_unit
 from instrument.sky.sources import Sources
 from instrument.sky.tables import Column, Table, say, say_unread, unit_scale
@@ -308,20 +307,19 @@ def _sky(
     terms = [data[t] for t in ("spectral_index", "spectral_curvature") if t in data]
     if len(rows) > 2 and terms and np.median(terms[0]) > 0.3:
         say(table, f"most spectral indices are positive (median {np.median(terms[0]):.2g}); fluxes go as (f/f0)^index")
-    try:
-        return make(
-            names=tuple(names[k] for k in rows) if names else tuple(f"s{k}" for k in rows),
-            patches=tuple(patches[k] for k in rows) if patches and any(patches) else (),
-            ra_rad=data["ra"],
-            dec_rad=data["dec"],
-            stokes_jy=np.stack([data["i"], *(data.get(s, none) for s in "quv")], axis=1),
-            reference_hz=data.get("ref_freq"),
-            spectral_terms=np.stack(terms, axis=1) if terms else None,
-            rotation_measure=data.get("rotation_measure"),
-            major_rad=data.get("major"),
-            minor_rad=data.get("minor"),
-            angle_rad=data.get("angle"),
-            not_read=(f"{harmless(table.path.name)}: {', '.join(unread)}",) if unread else (),
-        )
-    except InputError as error:
-        raise broken(table.path, None, str(error)) from None
+    return made(
+        make,
+        table.path,
+        names=tuple(names[k] for k in rows) if names else tuple(f"s{k}" for k in rows),
+        patches=tuple(patches[k] for k in rows) if patches and any(patches) else (),
+        ra_rad=data["ra"],
+        dec_rad=data["dec"],
+        stokes_jy=np.stack([data["i"], *(data.get(s, none) for s in "quv")], axis=1),
+        reference_hz=data.get("ref_freq"),
+        spectral_terms=np.stack(terms, axis=1) if terms else None,
+        rotation_measure=data.get("rotation_measure"),
+        major_rad=data.get("major"),
+        minor_rad=data.get("minor"),
+        angle_rad=data.get("angle"),
+        not_read=(f"{harmless(table.path.name)}: {', '.join(unread)}",) if unread else (),
+    )
