@@ -58,3 +58,17 @@ def test_its_q_and_u_are_those_of_the_iau(time, ra, dec, stokes):
     wave /= np.linalg.norm(wave)
     # its rotation is of the sky as a whole: aberration is 1e-4
     np.testing.assert_allclose(model.coherency_calc().value[:, :, 0, 0], np.outer(wave, wave), atol=3e-4)
+
+
+@pytest.mark.parametrize("freq", [None, 150 * u.MHz])
+def test_pyradiosky_reads_what_is_written(tmp_path, freq):
+    places = SkyCoord([10, 20.123456789], [-30, 40], unit="deg")
+    fields = {} if freq is None else {"spectral_terms": [[-0.7], [-0.8]], "polarization_follows_i": [True, True]}
+    sky = PointSky.at(places, STOKES[:, 0].T, freq, names=["a", "b"], patches=("", "p"), **fields)
+    sky.write(tmp_path / "m.skyh5")
+    model = SkyModel.from_file(tmp_path / "m.skyh5")
+    assert (list(model.name), list(model.extended_model_group)) == (["a", "b"], ["", "p"])
+    assert model.ra.rad.tolist() == sky.ra_rad.tolist()
+    assert model.dec.rad.tolist() == sky.dec_rad.tolist()
+    there = model.stokes if freq is None else model.at_frequencies([75] * u.MHz, inplace=False).stokes
+    np.testing.assert_allclose(there.to_value("Jy")[:, 0], sky.stokes(np.array([75e6]))[0].T, rtol=1e-14)

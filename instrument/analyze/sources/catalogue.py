@@ -16,12 +16,13 @@ from instrument.image.cube import StokesCube
 from instrument.numbers import Index, Whole
 from instrument.observe.directions import tangents
 from instrument.shown import short_repr
-from instrument.sky.bbs import write_bbs
 from instrument.sky.points import PointSky
 from instrument.units import Bool, Float, Int, one_si, unit_vectors
 from instrument.whole_file import whole_file, write_ecsv
 
-ENDINGS = {".ecsv": "ECSV", ".fits": "FITS", ".skymodel": "BBS", ".bbs": "BBS", ".txt": "BBS"}
+ENDINGS = {".ecsv": "ECSV", ".fits": "FITS"} | dict.fromkeys(
+    (".skymodel", ".bbs", ".txt", ".csv", ".skyh5", ".osm"), "sky"
+)
 
 
 class Agreement(NamedTuple):
@@ -112,14 +113,14 @@ class SourceCatalogue:
         return out
 
     def write(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
-        """Write it, by the ending of the name: .ecsv, .fits, or the text of BBS (.skymodel, .bbs, .txt)."""
+        """Write it, by the ending of the name: .ecsv, .fits, both with errors, or its sky as `PointSky.write` does."""
         ending = Path(path).suffix.lower()
         if ending not in ENDINGS:
             raise InputError(f"{path}: a catalogue ends in {', '.join(ENDINGS)}")
         if ENDINGS[ending] == "ECSV":
             write_ecsv(self.table(), path, overwrite)
-        elif ENDINGS[ending] == "BBS":
-            write_bbs(path, self.sky(), overwrite)
+        elif ENDINGS[ending] == "sky":
+            self.sky().write(path, overwrite)
         else:
             table = self.table()
             table.meta = {}
