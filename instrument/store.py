@@ -1,4 +1,4 @@
-"""Store: visibilities in HDF5, written and read block by block; all of their state comes back to the last bit."""
+"""Store: visibilities in HDF5 or Zarr, written and read block by block; all of their state comes back bit for bit."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from instrument import h5
+from instrument import h5, zarr_tree
 from instrument.beam_state import BeamState
 from instrument.errors import BeamStateError, FileError, InputError, warn
 from instrument.files_in import harmless
@@ -25,7 +25,7 @@ from instrument.observe.layout import Layout
 from instrument.observe.sampling import Sampling
 from instrument.provenance import written_by
 from instrument.units import Direction
-from instrument.whole_file import whole_file
+from instrument.whole_file import whole_file, whole_folder
 
 FORMAT, VERSION = "instrument visibilities", 3
 KNOWN = (1, 2, 3)  # in 1 array factors and elements are those of EveryBeam and have no `phase`
@@ -45,8 +45,12 @@ def write(path: str | os.PathLike[str], blocks: Iterable[Any], overwrite: bool =
     """Write visibilities (T, F, B, 2, 2) block by block, whole or not; raises `InputError` for blocks that clash.
 
     Blocks are of the same stations, baselines, phase centre and beam state, and fill times by channels once each.
+    A name in .zarr becomes a folder of Zarr, any other a file of HDF5.
     """
-    with whole_file(path, overwrite) as partial:
+    if zarr_tree.is_zarr(path):
+        zarr_tree.library()
+    whole = whole_folder(path, zarr_tree.MARK, overwrite) if zarr_tree.is_zarr(path) else whole_file(path, overwrite)
+    with whole as partial:
         writer = None
         try:
             for block in blocks:
@@ -84,7 +88,7 @@ class StoreWriter:
     """A new file that is filled block by block; `finish` closes it."""
 
     def __init__(self, path: str | os.PathLike[str], first: Any) -> None:
-        self.created = h5.Created(path)
+        self.created = (zarr_tree if zarr_tree.is_zarr(path) else h5).Created(path)
         self.file, self.fixed = (file := self.created.file), _fixed(first)
         self.known = first.layout, first.beam_state
         self.slots: dict[float, int] = {}
@@ -213,7 +217,8 @@ class Store:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = os.fspath(path)
         self.name = harmless(Path(self.path).name)
-        with h5.opened(path, WHAT) as file:
+        self.disk: Any = zarr_tree if zarr_tree.is_zarr(path) else h5
+        with self.disk.opened(path, WHAT) as file:
             sets = self._sets(file)
             self.shape = sets["data"].shape[:3]
             small = {n: np.asarray(d[()]) for n, d in sets.items() if n not in LARGE}
@@ -233,14 +238,15 @@ class Store:
     def _sets(self, file: Any) -> dict[str, Any]:
         """All arrays, not yet read, with the shapes that they must have."""
         if h5.text(file.attrs.get("format", "")) != FORMAT:
-            like = "an h5parm, which read_h5parm reads" if "sol000" in file else "another HDF5 file"
+            other = "another HDF5 file" if self.disk is h5 else "another Zarr folder"
+            like = "an h5parm, which read_h5parm reads" if "sol000" in file else other
             raise FileError(f"{self.name} is no {WHAT} (Visibilities.save): it is {like}")
         if (version := int(file.attrs.get("version", 0))) not in KNOWN:
             raise FileError(f"{self.name}: version {version} of the format is not one of {KNOWN}: take a newer program")
-        there = h5.members(file)
+        there = self.disk.members(file)
         needed = ("data", "freq_hz", *PER_TIME[:3], *FIXED, "weight", "flag", "interval_s")
         known = [n for n in ("data", "freq_hz", *PER_TIME, *FIXED, "steered", *SPREAD) if n in needed or n in there]
-        sets = {name: h5.dataset(file, name, KINDS.get(name, "f")) for name in known}
+        sets = {name: self.disk.dataset(file, name, KINDS.get(name, "f")) for name in known}
         t, f, b = (*sets["data"].shape, 0, 0, 0)[:3]
         s = sets["ra_rad"].size
         due = {
@@ -260,7 +266,7 @@ class Store:
             shape = tuple(whole[axis] for axis in axes) if len(axes) == 1 else whole[: 5 if len(given) == 5 else 3]
             if len(given) != len(shape) or any(n not in (1, m) for n, m in zip(given, shape, strict=True)):
                 raise FileError(f"{self.name}: '{name}' has shape {given}, needed {shape} with length 1 where constant")
-        h5.demand_affordable(list(sets.values()))
+        self.disk.demand_affordable(list(sets.values()))
         return sets
 
     def arguments(self, times: slice, channels: slice) -> dict[str, Any]:
@@ -272,7 +278,7 @@ class Store:
         afford(
             size * self.shape[2], f"{self.name}: what is asked for", "choose times= or channels=, or take its blocks"
         )
-        with h5.opened(self.path, WHAT) as file:
+        with self.disk.opened(self.path, WHAT) as file:
             sets = self._sets(file)
             out = {"data": sets["data"][t, f]}
             for name, axes in SPREAD.items():

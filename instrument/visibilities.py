@@ -51,7 +51,7 @@ class VisibilitySet(ABC):
             yield replace(block, data=zeros, weight=block.effective_weight)
 
     def save(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
-        """Write the blocks one by one to an HDF5 file, whole or not at all, which `Visibilities.open` reads."""
+        """Write the blocks one by one, whole or not at all, to HDF5, or to Zarr where `path` ends in .zarr."""
         store.write(path, self.blocks(), overwrite)
 
 

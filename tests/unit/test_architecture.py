@@ -29,6 +29,7 @@ LAYERS = (
     ("units", "checked"),
     ("files_in", "memory", "machine"),
     ("h5",),
+    ("zarr_tree",),
     ("registry", "mat2", "phasor", "patience"),
     ("component",),
     ("plugin_settings",),
