@@ -32,6 +32,8 @@ from .experiments.incomplete_model import IncompleteModel as IncompleteModel
 from .files.fits import read_cube as read_cube
 from .files.fits_psf import read_psf as read_psf
 from .files.measurement_set import MeasurementSet as MeasurementSet
+from .files.msv4_file import Msv4File as Msv4File
+from .files.msv4_file import write_msv4 as write_msv4
 from .files.number_list import read_frequencies as read_frequencies
 from .files.solutions import read_h5parm as read_h5parm
 from .files.solutions import write_h5parm as write_h5parm

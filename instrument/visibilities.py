@@ -22,6 +22,7 @@ from instrument.jones.chain import Chain
 from instrument.jones.gain import exact_key, slot_normals
 from instrument.jones.towards import Towards, towards_in
 from instrument.model import Instrument
+from instrument.msv4 import tree_of
 from instrument.observe.closure import stations_of
 from instrument.observe.layout import Layout
 from instrument.observe.sampling import Sampling, times_of
@@ -230,6 +231,10 @@ class Visibilities(VisibilitySet):
     def weighted(self, weight: Float) -> Visibilities:
         """The same with other weights, (T, F, B) or (T, F, B, 2, 2), length 1 where constant; none below 0."""
         return replace(self, weight=plain(weight, float, "weight"))
+
+    def to_xarray(self) -> Any:
+        """An xarray DataTree in the schema of MSv4 (extra `xarray`); `write_msv4` writes it, `Msv4File` reads it."""
+        return tree_of(self)
 
     def stokes(self) -> Complex:
         """Stokes visibilities I, Q, U, V in Jy, complex (T, F, B, 4): I = (pp+qq)/2 and so on."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 
 from instrument.checked import checked
 from instrument.errors import InputError
@@ -26,6 +27,14 @@ def as_set(given: VisibilitySet | Iterable[Visibilities], twice: str = "") -> Vi
     if twice and blocks.once:
         raise InputError(f"{twice} go over the visibilities twice: {REMEDY}")
     return blocks
+
+
+def as_one(given: VisibilitySet | Iterable[Visibilities], beside: Path) -> Visibilities:
+    """All blocks as one, brought together in a file at `beside`, a name that is free and stays."""
+    if isinstance(given, Visibilities):
+        return given
+    as_set(given).save(beside)
+    return Visibilities.open(beside)
 
 
 REMEDY = "these blocks can be gone through once: give the plan itself, a list of blocks, or a file of them"

@@ -17,7 +17,7 @@ from instrument.files.uv_file import JD_OF_MJD, MEAN
 from instrument.memory import afford
 from instrument.provenance import written_by
 from instrument.visibilities import Visibilities, VisibilitySet
-from instrument.visibility_sets import as_set
+from instrument.visibility_sets import as_one
 from instrument.whole_file import whole_file
 
 LINEAR = (-5, -6, -7, -8)  # xx, yy, xy, yx, as AIPS numbers them
@@ -46,21 +46,13 @@ def write_uv(
         raise InputError(f"{path}: the name of the file is to end in one of {', '.join(KINDS)}")
     library()
     with whole_file(path, overwrite) as partial:
-        vis = _whole(visibilities, partial.parent / "blocks.h5")
+        vis = as_one(visibilities, partial.parent / "blocks.h5")
         afford(4 * vis.data.nbytes, f"{path}: all of it at once", "write fewer channels or times in a file")
         uv = _uv_data(path, vis, precision or ("double" if kind == "uvh5" else "single"), telescope)
         with told(path):
             (uv.write_uvh5 if kind == "uvh5" else uv.write_uvfits)(str(partial))
             if kind == "uvfits" and max(map(len, vis.layout.names)) > NAME_LENGTH:
                 _name_antennas(partial, vis.layout.names)
-
-
-def _whole(given: VisibilitySet | Iterable[Visibilities], beside: Path) -> Visibilities:
-    """All blocks as one."""
-    if isinstance(given, Visibilities):
-        return given
-    as_set(given).save(beside)
-    return Visibilities.open(beside)
 
 
 def _uv_data(path: Any, vis: Visibilities, precision: str, telescope: str) -> Any:

@@ -184,6 +184,8 @@ def calls():
         ("UVFile", ins.UVFile, {"path": "none.uvh5", "window": 0, "field": 0, "centre": "0h 0d"}),
         ("write_uv", ins.write_uv, {
             "path": "none/v.uvh5", "visibilities": w.vis, "overwrite": True, "precision": "single", "telescope": "X"}),
+        ("Msv4File", ins.Msv4File, {"path": "none.zarr", "name": "a", "group": "base"}),
+        ("write_msv4", ins.write_msv4, {"path": "none/v.zarr", "visibilities": w.vis, "overwrite": True}),
         ("Visibilities.without_beam", w.vis.without_beam, {"instrument": w.instrument}),
         ("JonesTable.jones", w.solution.term.jones, {"at": w.at}),
         ("SelfCal.solve", ins.SelfCal().solve, {"data": w.vis, "model": w.vis}),

@@ -38,7 +38,7 @@ LAYERS = (
     ("sky", "model"),
     ("beam_state", "correlations", "visibility_checks"),
     ("station_jones", "averaging", "recentred"),
-    ("store",),
+    ("store", "msv4"),
     ("visibilities",),
     ("visibility_sets",),
     ("predict",),
