@@ -1,7 +1,7 @@
 """SkyH5, the HDF5 files of pyradiosky: lists of point sources, read and written without it.
 
-Q, U and V are taken as those of the IAU, as they stand: pyradiosky's own coherencies in the sky are then right in Q and
-U. It does not say which sign its V has. All four carry the spectral index.
+Q, U and V are those of the IAU: pyradiosky's coherencies in the sky show it (tests/peers). V changes its sign between
+such a file and a sky, whose V is minus that of the IAU. All four carry the spectral index.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from instrument.units import Float
 S = TypeVar("S", bound=Sources)
 HDF5 = b"\x89HDF\r\n\x1a\n"
 FRAMES = {"icrs": ("ra", "dec"), "fk5": ("ra", "dec"), "galactic": ("l", "b")}
+IAU = np.array([1.0, 1.0, 1.0, -1.0])  # times I, Q, U, V: from one to the other
 SAME = 1e-9  # of a frequency: the channel that is asked for
 UNREAD = ("beam_amp", "stokes_error")
 
@@ -51,7 +52,7 @@ def read_skyh5(make: type[S], path: Path, frequency: float | None = None) -> S:
             raise broken(path, None, f"{count:,} sources; at most {ROWS_AT_MOST:,} are read: cut out what is needed")
         demand_affordable([flux])
         channel, freq, terms = _spectra(path, header, parts, flux.shape[1:], frequency)
-        stokes = numbers(flux, (slice(None), channel)).T * _scale(path, flux, "Jy")
+        stokes = IAU * numbers(flux, (slice(None), channel)).T * _scale(path, flux, "Jy")
         ra, dec = _places(path, parts, header, bool(stokes[:, 1:3].any()))
         group = parts.get("extended_model_group")
         listed = {
@@ -183,5 +184,5 @@ def write_skyh5(path: Path, sky: Sources) -> None:
         for name, values, kind in (("ra", sky.ra_rad, "longitude"), ("dec", sky.dec_rad, "latitude")):
             group[name] = values
             group[name].attrs["unit"], group[name].attrs["object_type"] = "rad", kind
-        data["stokes"] = sky.stokes_jy.T[:, None]
+        data["stokes"] = (IAU * sky.stokes_jy).T[:, None]
         data["stokes"].attrs["unit"] = "Jy"

@@ -182,6 +182,13 @@ def calls():
         ("VisibilityFile", ins.VisibilityFile, {"path": "none.h5"}),
         ("MeasurementSet", ins.MeasurementSet, {"path": "none.MS", "column": "DATA", "window": 0, "field": 0}),
         ("UVFile", ins.UVFile, {"path": "none.uvh5", "window": 0, "field": 0, "centre": "0h 0d"}),
+        ("write_uvbeam", ins.write_uvbeam, {
+            "path": "none/b.beamfits", "telescope": w.instrument, "time": "2012-12-07", "frequencies": 150 * u.MHz,
+            "station": None, "pointing": CENTRE, "step": 45 * u.deg, "overwrite": True}),
+        ("write_mueller", ins.write_mueller, {
+            "path": "none/m.fits", "telescope": w.instrument, "times": "2012-12-07", "frequencies": 150 * u.MHz,
+            "grid": ins.ImageGrid(pixels=2, pixel=1 * u.deg, centre=CENTRE), "baseline": "mean", "state": "absolute",
+            "overwrite": True}),
         ("write_uv", ins.write_uv, {
             "path": "none/v.uvh5", "visibilities": w.vis, "overwrite": True, "precision": "single", "telescope": "X"}),
         ("Msv4File", ins.Msv4File, {"path": "none.zarr", "name": "a", "group": "base"}),

@@ -197,7 +197,7 @@ def test_skyh5_is_read_with_its_units(skyh5):
     sky = PointSky.read(skyh5())
     assert (sky.names, sky.patches, sky.reference_hz.tolist()) == (("a", "b"), (), [150e6, 160e6])
     np.testing.assert_allclose(np.rad2deg([sky.ra_rad, sky.dec_rad]), [[10, 20], [-30, 40]], rtol=1e-14)
-    np.testing.assert_allclose(at(sky, 75)[0], 2**0.7 * np.array([1, 0.1, -0.2, 0.3]), rtol=1e-14)
+    np.testing.assert_allclose(at(sky, 75)[0], 2**0.7 * np.array([1, 0.1, -0.2, -0.3]), rtol=1e-14)
 
 
 def test_of_several_channels_of_skyh5_one_is_asked_for(skyh5):
@@ -212,7 +212,7 @@ def test_of_several_channels_of_skyh5_one_is_asked_for(skyh5):
     with pytest.raises(FileError, match="has no fluxes at 150 MHz"):
         PointSky.read(path, frequency="150 MHz")
     sky = PointSky.read(path, frequency="200 MHz")
-    assert (sky.stokes_jy.tolist(), sky.reference_hz.tolist()) == ([[2, 6, 10, 14], [3, 7, 11, 15]], [200e6, 200e6])
+    assert (sky.stokes_jy.tolist(), sky.reference_hz.tolist()) == ([[2, 6, 10, -14], [3, 7, 11, -15]], [200e6, 200e6])
 
 
 def test_galactic_places_are_brought_to_icrs_but_not_q_and_u(skyh5):
