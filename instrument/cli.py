@@ -76,7 +76,9 @@ def parser() -> argparse.ArgumentParser:
     verbs.add_parser("scenes", help="List the shipped scenes.")
     plugins = verbs.add_parser("plugins", help="List the plugins, and what is broken; with a NAME its settings.")
     plugins.add_argument("name", metavar="NAME", nargs="?", help="a plugin: its settings, their units and defaults")
-    verbs.add_parser("doctor", help="Check this installation: versions, tables, threads, memory, a self-test.")
+    verbs.add_parser(
+        "doctor", help="Check this installation: versions, optional parts, tables, memory, a self-test, a known beam."
+    )
     return top
 
 

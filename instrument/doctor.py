@@ -1,4 +1,4 @@
-"""Doctor: versions, tables, threads, memory and a self-test of this installation, in a few seconds."""
+"""Doctor: versions, optional parts, tables, memory, a self-test and a known beam, in a few seconds."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from instrument.doctor_checks import BEAM_AGREES, coexistence, extras, known_beams
 from instrument.machine import kept_in, measured_and_kept
 from instrument.pipeline.folder import leftovers
 from instrument.pipeline.record import package_version
@@ -28,12 +29,6 @@ NEEDED = (
     "jinja2",
     "rich",
 )
-OPTIONAL = {
-    "distributed": "blocks on a Dask cluster",
-    "everybeam": "peer tests",
-    "dp3": "peer tests",
-    "python-casacore": "peer tests",
-}
 
 
 def doctor(show: Callable[[str], None]) -> bool:
@@ -41,8 +36,10 @@ def doctor(show: Callable[[str], None]) -> bool:
     show(f"python        {platform.python_version()} on {platform.platform()}")
     for name in NEEDED:
         show(f"{name:<20} {package_version(name)}")
-    for name, use in OPTIONAL.items():
-        show(f"{name:<20} {package_version(name)} (optional: {use})")
+    for line in extras():
+        show(f"extra  {line}")
+    for line in coexistence():
+        show(f"together      {line}")
     show(f"cores         {os.cpu_count()}")
     show(f"memory        {_memory_gb():.1f} GB")
     show(f"speed         {measured_and_kept():.2f} of the machine on which costs were measured (kept in {kept_in()})")
@@ -63,7 +60,20 @@ def doctor(show: Callable[[str], None]) -> bool:
     good = error < 1e-10
     verdict = "right" if good else "WRONG"
     show(f"self-test     matrix against direct, 7 stations, 9 sources: {error:.1e} ({verdict})")
-    return fine and good
+    return fine and good and _beams(show)
+
+
+def _beams(show: Callable[[str], None]) -> bool:
+    """Whether beams are those of EveryBeam; said for each telescope that is there."""
+    found = known_beams()
+    for name, apart in found.items():
+        verdict = "right" if apart < BEAM_AGREES else "WRONG"
+        show(
+            f"beam          {name} against EveryBeam's matrices, from coordinates: {apart:.1e} of the peak ({verdict})"
+        )
+    if not found:
+        show("beam          not checked: no telescope whose beam is known is installed")
+    return all(apart < BEAM_AGREES for apart in found.values())
 
 
 def self_test() -> float:

@@ -60,6 +60,7 @@ LAYERS = (
     ("precision",),
     ("stress",),
     ("paper",),
+    ("doctor_checks",),
     ("doctor",),
     ("",),  # `instrument` itself, which looks names up in all of them when they are first used
     ("cli",),
