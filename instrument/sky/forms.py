@@ -17,7 +17,7 @@ from instrument.sky.bbs import read_bbs
 from instrument.sky.bbs_text import broken, is_bbs
 from instrument.sky.binary_tables import fits_table, votable
 from instrument.sky.foreign import refuse_foreign
-from instrument.sky.programs import program_of
+from instrument.sky.programs import demand_plain, program_of
 from instrument.sky.skyh5 import HDF5, read_skyh5
 from instrument.sky.sources import Sources
 from instrument.sky.table_sky import Choices, Incomplete, Sizes, sky_of
@@ -90,7 +90,9 @@ def read_as(
     of_bbs = is_bbs(_head(raw))
     if not of_bbs:
         if (program := program_of(name, _head(raw))) is not None:
-            read: S = program(make, file, _lines(file, raw))
+            lines = _lines(file, raw)
+            demand_plain(file, lines)
+            read: S = program(make, file, lines)
             return read
         refuse_foreign(file, raw)
     if b"\0" not in raw[:4096] and (name.endswith(BBS_SUFFIXES) or of_bbs):

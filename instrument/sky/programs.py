@@ -19,7 +19,7 @@ import numpy as np
 from instrument.errors import unused
 from instrument.files_in import SHOWN, harmless
 from instrument.sky.ao_text import components
-from instrument.sky.bbs_text import broken, made
+from instrument.sky.bbs_text import LINES_AT_MOST, broken, made
 from instrument.sky.sources import Sources
 
 S = TypeVar("S", bound=Sources)
@@ -34,6 +34,7 @@ TIGGER_KNOWN = re.compile(
     r"name|[iquv]|rm|spi[2-9]?|freq0|(?:ra|dec)_(?:rad|[dhms])|dec_sign|e(?:maj|min)_(?:rad|[dms])|pa_(?:rad|d)",
 )
 TIGGER_REFUSED = re.compile(r"pol_frac|pol_pa_\w+|sbeta[lm]\w*|shapelet_coeffs")
+LONGEST_LINE = 10_000
 OSKAR = 12  # numbers a line
 
 
@@ -64,6 +65,15 @@ def program_of(name: str, lines: Sequence[str]) -> Callable[..., Any] | None:
     if headed or SAGECAL_ROW.match(data):
         return read_sagecal
     return read_oskar if name.endswith(".osm") else None
+
+
+def demand_plain(path: Path, lines: Sequence[str]) -> None:
+    """Raises `FileError` for text that would take gigabytes as names and numbers: too many lines, or too long ones."""
+    if len(lines) > LINES_AT_MOST:
+        raise broken(path, None, f"{len(lines):,} lines; at most {LINES_AT_MOST:,} are read: cut out what is needed")
+    long = next((k for k, t in enumerate(lines, 1) if len(t) > LONGEST_LINE), None)
+    if long is not None:
+        raise broken(path, long, f"more than {LONGEST_LINE:,} characters; a source takes a few hundred")
 
 
 def listed(make: type[S], path: Path, rows: list[Row]) -> S:

@@ -132,6 +132,8 @@ def test_a_gaussian_is_long_towards_its_position_angle(read, text):
         (f"S3C61 {PLACE} 2 0 0 0 -0.8 0 1 1 0 150e6\n", "line 1: 'S3C61' is a shapelet to SAGECal"),
         ("P1 8 13 35.98 99 12 59.17 2 0 0 0 -0.8 0 0 0 0 150e6\n", "line 1: .* declination 99.2164 are beyond the sky"),
         (2 * f"P1 {PLACE} 2 0 0 0 -0.8 0 0 0 0 150e6\n", "line 2: source 'P1' was there before, on line 1"),
+        (f"P1 {PLACE} 2 0 0 0 -0.8 0 0 0 0 150e6" + 10_000 * " 1", "line 1: more than 10,000 characters"),
+        (f"P1 {PLACE} 2 0 0 0 -0.8 0 0 0 0 150e6\n" + 600_000 * "\n", "at most 500,000 are read"),
         ("#format: name ra_d dec_d\nA 1 2\n", "line 1: .*needs i"),
         ("#format: name ra_d ra_h dec_d i\nA 1 2 3 4\n", "line 1: .*needs one of ra_h, ra_d or ra_rad"),
         ("#format: name ra_d dec_d i pol_frac\nA 1 2 3 0.1\n", "line 1: column 'pol_frac' is not read; give q and u"),

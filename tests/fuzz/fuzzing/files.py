@@ -40,8 +40,9 @@ def both(*setups):
 def catalogues(rng: random.Random, made: Seeds) -> Iterator[Case]:
     """Catalogues mutated, named by a scene."""
     while True:
-        ext = rng.choice(["skymodel", "skymodel", "csv", "csv", "ecsv", "vot", "fits"])
-        how = mutations.fits if ext == "fits" else rng.choice([mutations.text, mutations.number, mutations.words])
+        ext = rng.choice(["skymodel", "csv", "ecsv", "vot", "fits", "skyh5", *seeds.PROGRAMS])
+        how = {"fits": mutations.fits, "skyh5": rng.choice([mutations.flipped, mutations.cut])}.get(ext)
+        how = how or rng.choice([mutations.text, mutations.number, mutations.words])
         content = how(rng, made.catalogues[ext])
         scene = seeds.CATALOGUE.replace("PATH", f"c.{ext}")
         setup = both(written(f"c.{ext}", content), written("s.toml", scene))

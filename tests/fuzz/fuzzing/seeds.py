@@ -76,10 +76,30 @@ CSV = "name,ra_deg,dec_deg,i_jy,q_jy,spectral_index,ref_freq_mhz,rm,major_arcsec
 )
 
 
+PROGRAMS = {  # other programs' text, by the extension of its seed
+    "osm": "".join(
+        f"{123 + 0.3 * k}, {48.2 + 0.2 * k}, {k + 1}, 0, 0, 0, 150e6, -0.7, 1, 30, 20, 10\n" for k in range(5)
+    ),
+    "sagecal": "".join(f"P{k} 8 13 {36 + k}.0 48 1{k} 3.0 {k + 1} 0 0 0 -0.7 .01 0 0 0 0 0 150e6\n" for k in range(5)),
+    "tigger": "#format: name ra_h ra_m ra_s dec_d dec_m dec_s i q u v spi rm emaj_s emin_s pa_d freq0 tags...\n"
+    + "".join(f"T{k} 8 13 {36 + k}.0 48 1{k} 3.0 {k + 1} 0 0 0 -0.7 1 30 20 10 150e6 +a\n" for k in range(5)),
+    "ao": "skymodel fileformat 1.1\n"
+    + "".join(
+        f'source {{\n  name "A {k}"\n  component {{\n    type gaussian\n    position 8h13m{36 + k}.0s 48d1{k}m3.0s\n'
+        f"    shape 30 20 10\n    sed {{\n      frequency 150 MHz\n      fluxdensity Jy {k + 1} 0 0 0\n"
+        "      spectral-index { -0.7 0.0 }\n    }\n  }\n}\n"
+        for k in range(5)
+    ),
+}
+
+
 def catalogues(folder: Path) -> dict[str, bytes]:
     """A catalogue of five sources in every format, by extension."""
     from astropy import units as u
+    from astropy.coordinates import SkyCoord
     from astropy.table import Table
+
+    from instrument import PointSky
 
     k = np.arange(5)
     table = Table(
@@ -97,11 +117,13 @@ def catalogues(folder: Path) -> dict[str, bytes]:
             "angle": np.full(5, 10.0) * u.deg,
         }
     )
-    found = {"skymodel": BBS.encode(), "csv": CSV.encode()}
+    found = {"skymodel": BBS.encode(), "csv": CSV.encode()} | {ext: text.encode() for ext, text in PROGRAMS.items()}
     for ext, form in (("ecsv", "ascii.ecsv"), ("fits", "fits"), ("vot", "votable")):
         table.write(folder / f"seed.{ext}", format=form, overwrite=True)
         found[ext] = (folder / f"seed.{ext}").read_bytes()
-    return found
+    places = SkyCoord(123.4 + 0.3 * k, 48.2 + 0.2 * k, unit="deg")
+    PointSky.at(places, 1.0 + k, 150 * u.MHz).write(folder / "seed.skyh5", overwrite=True)
+    return found | {"skyh5": (folder / "seed.skyh5").read_bytes()}
 
 
 def cubes(folder: Path) -> dict[str, bytes]:
