@@ -31,6 +31,7 @@ from .errors import Outcome as Outcome
 from .experiments.incomplete_model import IncompleteModel as IncompleteModel
 from .files.beam_files import write_mueller as write_mueller
 from .files.beam_files import write_uvbeam as write_uvbeam
+from .files.calfits import write_calfits as write_calfits
 from .files.fits import read_cube as read_cube
 from .files.fits_psf import read_psf as read_psf
 from .files.measurement_set import MeasurementSet as MeasurementSet

@@ -24,7 +24,7 @@ from instrument.jones.table import JonesTable
 from instrument.observe.layout import Layout
 from instrument.observe.sampling import Sampling
 from instrument.provenance import written_by
-from instrument.units import Complex, Float, direction
+from instrument.units import Bool, Complex, Float, direction
 from instrument.whole_file import whole_file
 
 Pattern = Literal["full", "diagonal", "scalar", "phase"]
@@ -85,6 +85,19 @@ def write_h5parm(
                 soltab[name] = array.reshape([len(along[axis]) for axis in axes])
                 soltab[name].attrs["AXES"] = np.bytes_(",".join(axes))
             soltab["val"].attrs["HISTORY000"] = np.bytes_(history.encode()[:60000])  # an attribute holds 64 kB
+
+
+def diagonal_gains(
+    solution: Solution | JonesTable, at: Sampling
+) -> tuple[Complex, Bool, Float, Float, tuple[str, ...]]:
+    """Gains (t, f, A, 2) of receptors, which are usable (t, f, A); times, channels (0: constant) and stations.
+
+    Raises `InputError` where entries off the diagonal would be lost.
+    """
+    values, _, slots_s, freq_hz, names = _stacked({"": solution}, at)
+    one = values[:, :, :, 0]
+    usable: Any = np.isfinite(one).all(axis=(-2, -1)) & np.isfinite(mat2.inverse(one)).all(axis=(-2, -1))
+    return _in_pattern(one, "diagonal"), usable, slots_s, freq_hz, names
 
 
 def _stacked(

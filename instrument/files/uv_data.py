@@ -6,11 +6,16 @@ import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from instrument.errors import FileError, InputError
 from instrument.files_in import harmless
+from instrument.observe.layout import Layout
 
+NAME_LENGTH = 8  # of antennas in the FITS files of pyuvdata
 MISSING = "UVFITS and UVH5 need pyuvdata: pip install 'instrument[uv]'"
 KINDS = {".uvfits": "uvfits", ".uvh5": "uvh5"}
 # its numbers of correlations, those of AIPS, and casacore's
@@ -42,3 +47,35 @@ def told(path: str | os.PathLike[str]) -> Iterator[None]:
     except Exception as error:  # of fifty kinds, KeyError to UnicodeError, as files are broken
         text = " ".join((str(error) or type(error).__name__).split())
         raise FileError(f"{harmless(path)}: {harmless(text, 300)}") from None
+
+
+def telescope_of(layout: Layout, name: str = "unknown") -> Any:
+    """The stations as its `Telescope`: numbered from 1, the place of the array that of the first."""
+    from astropy import units as u
+    from astropy.coordinates import EarthLocation
+
+    site = layout.positions_m[0]
+    return library().Telescope.new(
+        name=name, instrument=name, location=EarthLocation.from_geocentric(*(site * u.m)),
+        antenna_positions=layout.positions_m - site, antenna_names=list(layout.names),
+        antenna_numbers=np.arange(len(layout)) + 1, feed_array=["x", "y"], feed_angle=[0.0, np.pi / 2],
+        mount_type="other", update_from_known=False,
+    )  # fmt: skip
+
+
+def name_antennas(path: Path, table: str, column: str, names: tuple[str, ...]) -> None:
+    """Put whole names of antennas into a FITS file, where they were cut to 8 characters."""
+    from astropy.io import fits
+
+    width = max(map(len, names))
+    if width <= NAME_LENGTH:
+        return
+    longer = path.with_name(f"named-{path.name}")
+    with fits.open(path, memmap=True) as hdus:
+        old = hdus[table]
+        whole = fits.Column(name=column, format=f"{width}A", array=np.array(names))
+        new = fits.BinTableHDU.from_columns([whole if c.name == column else c for c in old.columns])
+        new.header.extend(old.header, unique=True, strip=True)
+        hdus[hdus.index_of(table)] = new
+        hdus.writeto(longer)
+    longer.replace(path)

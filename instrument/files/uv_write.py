@@ -12,7 +12,7 @@ import numpy as np
 from instrument.checked import checked
 from instrument.errors import InputError
 from instrument.files.ms_frame import beam_words
-from instrument.files.uv_data import KINDS, library, told
+from instrument.files.uv_data import KINDS, library, name_antennas, telescope_of, told
 from instrument.files.uv_file import JD_OF_MJD, MEAN
 from instrument.memory import afford
 from instrument.provenance import written_by
@@ -22,7 +22,6 @@ from instrument.whole_file import whole_file
 
 LINEAR = (-5, -6, -7, -8)  # xx, yy, xy, yx, as AIPS numbers them
 PLACES = [0, 3, 1, 2]  # of these among pp, pq, qp, qq
-NAME_LENGTH = 8  # of an antenna that pyuvdata writes into UVFITS
 
 
 @checked
@@ -51,15 +50,12 @@ def write_uv(
         uv = _uv_data(path, vis, precision or ("double" if kind == "uvh5" else "single"), telescope)
         with told(path):
             (uv.write_uvh5 if kind == "uvh5" else uv.write_uvfits)(str(partial))
-            if kind == "uvfits" and max(map(len, vis.layout.names)) > NAME_LENGTH:
-                _name_antennas(partial, vis.layout.names)
+            if kind == "uvfits":
+                name_antennas(partial, "AIPS AN", "ANNAME", vis.layout.names)
 
 
 def _uv_data(path: Any, vis: Visibilities, precision: str, telescope: str) -> Any:
     """What pyuvdata holds of visibilities: rows by time, then by baseline."""
-    from astropy import units as u
-    from astropy.coordinates import EarthLocation
-
     if vis.width_hz is None:
         raise InputError(
             f"{path}: channels need a width, which is not known: give channel_width to the Observation, or "
@@ -77,18 +73,11 @@ def _uv_data(path: Any, vis: Visibilities, precision: str, telescope: str) -> An
         flat = wide.reshape(times, channels, baselines, 4)[..., PLACES]
         return np.ascontiguousarray(np.moveaxis(flat, 1, 2)).reshape(times * baselines, channels, 4)
 
-    site = vis.layout.positions_m[0]
-    location = EarthLocation.from_geocentric(*(site * u.m))
     double = precision == "double"
     with told(path):
-        scope = library().Telescope.new(
-            name=telescope, instrument=telescope, location=location, antenna_positions=vis.layout.positions_m - site,
-            antenna_names=list(vis.layout.names), antenna_numbers=np.arange(len(vis.layout)) + 1,
-            feed_array=["x", "y"], feed_angle=[0.0, np.pi / 2], mount_type="other", update_from_known=False,
-        )  # fmt: skip
         uv = library().UVData.new(
             freq_array=vis.freq_hz, polarization_array=np.array(LINEAR), times=JD_OF_MJD + vis.at.slots_s / 86400.0,
-            telescope=scope, antpairs=np.stack([first, second], 1) + 1, do_blt_outer=True,
+            telescope=telescope_of(vis.layout, telescope), antpairs=np.stack([first, second], 1) + 1, do_blt_outer=True,
             integration_time=np.array(np.broadcast_to(vis.interval_s, times)),
             channel_width=np.array(np.broadcast_to(vis.width_hz, channels)), update_telescope_from_known=False,
             data_array=rows(vis.data, conjugate=True).astype(np.complex128 if double else np.complex64),
@@ -112,22 +101,3 @@ def _beam(vis: Visibilities) -> dict[str, Any]:
     towards = words.get("LOFAR_APPLIED_BEAM_DIR")
     out: dict[str, Any] = {"BEAMMODE": words["LOFAR_APPLIED_BEAM_MODE"]}
     return out if towards is None else {**out, "BEAMRA": towards["m0"]["value"], "BEAMDEC": towards["m1"]["value"]}
-
-
-def _name_antennas(path: Path, names: tuple[str, ...]) -> None:
-    """Put whole names of antennas into a UVFITS file, which were cut to 8 characters."""
-    from astropy.io import fits
-
-    longer = path.with_name(f"named-{path.name}")
-    with fits.open(path, memmap=True) as hdus:
-        old = hdus["AIPS AN"]
-        width = max(map(len, names))
-        columns = [
-            fits.Column(name="ANNAME", format=f"{width}A", array=np.array(names)) if c.name == "ANNAME" else c
-            for c in old.columns
-        ]
-        new = fits.BinTableHDU.from_columns(columns)
-        new.header.extend(old.header, unique=True, strip=True)
-        hdus[hdus.index_of("AIPS AN")] = new
-        hdus.writeto(longer)
-    longer.replace(path)

@@ -191,6 +191,9 @@ def calls():
             "overwrite": True}),
         ("write_uv", ins.write_uv, {
             "path": "none/v.uvh5", "visibilities": w.vis, "overwrite": True, "precision": "single", "telescope": "X"}),
+        ("write_calfits", ins.write_calfits, {
+            "path": "none/v.calfits", "solution": w.solution, "at": w.at, "interval": 10 * u.s,
+            "channel_width": 1 * u.MHz, "overwrite": True}),
         ("Msv4File", ins.Msv4File, {"path": "none.zarr", "name": "a", "group": "base"}),
         ("write_msv4", ins.write_msv4, {"path": "none/v.zarr", "visibilities": w.vis, "overwrite": True}),
         ("Visibilities.without_beam", w.vis.without_beam, {"instrument": w.instrument}),
