@@ -10,6 +10,7 @@ from instrument.analyze.faraday.cube import FaradayCube
 from instrument.analyze.faraday.synthesis import Division, Precision, Synthesis, rm_synthesis
 from instrument.analyze.power.cells import Cells, cylindrical, spherical
 from instrument.analyze.power.cylinders import Cylindrical, Spherical
+from instrument.analyze.power.delay import Delay, delay_cells
 from instrument.analyze.power.fourier import Stokes, Taper
 from instrument.analyze.power.signal import Signal21cm
 from instrument.analyze.power.spectra import Spectrum2D, spectrum_2d
@@ -179,6 +180,30 @@ class Analyzer:
         """
         made = self.cells(stokes, taper, taper_space, uv_range, cross, psf_corrected, infill, redshift, cosmology)
         return spherical(made, bins, log, wedge, k_par_min)
+
+    def delay_spectrum(
+        self,
+        solid_angle: Any,
+        stokes: Stokes = "I",
+        taper: Taper | None = "blackman-harris",
+        across_times: bool = False,
+        bins: Any = 15,
+        redshift: float | None = None,
+        cosmology: Any = None,
+    ) -> Cylindrical:
+        """Power spectrum straight from visibilities in bins of k_perp and |k_par|, K² Mpc³; `.wedge()` as of cubes.
+
+        Each baseline is transformed along frequency at each time, and stands at k_perp of its u and v in the middle of
+        the band, in `bins` as those of `cylindrical`. `solid_angle` (sr) is the integral of the squared power beam, 1
+        at its peak: pi fwhm² / (8 ln 2) of a Gaussian. `across_times` multiplies every integration by the next: without
+        the bias of noise. Integrations of baselines that are not there in all channels are left out, and counted. The
+        noise of a Stokes parameter of variance s² is (c² / 2 k nu²)² D² Y dnu s² / Omega. `.cells.spherical()` is the
+        same over k.
+        """
+        if self.visibilities is None:
+            raise InputError("delay spectra are made of visibilities: Analyzer(visibilities=vis)")
+        how = Delay(solid_angle, stokes, taper, across_times, redshift, cosmology)
+        return cylindrical(delay_cells(self.visibilities, how), bins)
 
     def eor_window(
         self,

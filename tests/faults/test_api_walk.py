@@ -258,6 +258,9 @@ def calls():
             "stokes": "I", "taper": "hann", "taper_space": "hann", "uv_range": (10.0, 400.0), "bins": 4, "log": True,
             "wedge": 1 * u.deg, "k_par_min": 0.01, "cross": None, "psf_corrected": False, "infill": None,
             "redshift": 8.5, "cosmology": None}),
+        ("Analyzer.delay_spectrum", ins.Analyzer(visibilities=w.vis).delay_spectrum, {
+            "solid_angle": 0.1 * u.sr, "stokes": "I", "taper": None, "across_times": False,
+            "bins": 4, "redshift": 8.5, "cosmology": None}),
         ("Analyzer.eor_window", w.analyzer.eor_window, {
             "signal": w.signal, "stokes": "I", "noise": None, "wedge": 1 * u.deg, "k_par_min": 0.01, "bins": 4,
             "bins_par": 3}),

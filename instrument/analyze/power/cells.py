@@ -3,23 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from instrument.analyze.power.bins import Frame, Plane
 from instrument.analyze.power.cylinders import Cylindrical, Spherical, bounds_of, divided, length, rows_of
 from instrument.analyze.power.fourier import bin_edges, per_mpc, sine
-from instrument.analyze.power.modes import Modes
 from instrument.errors import InputError
-from instrument.units import FINITE, Float
+from instrument.units import FINITE, Float, Int
+
+
+class ModeCount(Protocol):
+    """How many independent modes bins have; see `Modes`."""
+
+    def cylindrical(self, cells: Plane, perp: Float, bounds: Int, rows: Int, bins_par: int) -> Float:
+        """Modes of bins of k_perp and k_par."""
+
+    def spherical(self, cells: Plane, edges: Float, bounds: Int, slope: float, least: float) -> Float:
+        """Modes of bins of k."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cells(Plane):
     """Cells with what makes them alike, from which spectra are made."""
 
-    modes: Modes  # which cells are alike: behind a taper, or of both signs
+    modes: ModeCount  # which cells are alike: behind a taper, or of both signs
     left_out: dict[str, int]
 
     def cylindrical(

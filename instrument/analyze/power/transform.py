@@ -86,7 +86,7 @@ def cells_of(cube: StokesCube, settings: Transform, cross: StokesCube | None = N
     # V / N^2 = cell / N: the volume of a voxel over their number
     scale = (distance * cube.pixel_rad) ** 2 * depth * (grid_hz[1] - grid_hz[0]) / (n * ny * nx * square)
     folds = _both_signs(n)
-    power, auto = _delays(spectra, along, folds, scale)
+    power, auto = delays(spectra, along, folds, scale)
     if not 1 / LARGEST**2 < float(auto.max()) < LARGEST**2:  # only then is it worth to look at all voxels
         squarable(max(_size(c, stokes) for c in cubes), stokes)
     frame = Frame(
@@ -246,7 +246,7 @@ def _columns_of(images: Float | Complex, columns: Int, out: Complex | None = Non
     return np.asarray(fft.c2c(first, axes=(images.ndim - 2,), out=first if out is None else out, nthreads=0))
 
 
-def _delays(spectra: list[Complex], along: Float, folds: Float, scale: float) -> tuple[Float, Float]:
+def delays(spectra: list[Complex], along: Float, folds: Float, scale: float) -> tuple[Float, Float]:
     """Power of delays 0 to Nyquist (M, N), mean over both signs, across and by itself."""
     from ducc0 import fft
 
