@@ -95,13 +95,15 @@ def _add_out(verb: argparse.ArgumentParser, text: str = "") -> None:
 
 
 def _add_paper(verbs: Any) -> None:
-    from instrument.paper.experiments import EXPERIMENTS
+    from instrument.paper.experiments import described
 
     text = "Run what Asad et al. (2015) did: the paper's numbers, ours, and why they differ."
-    verb = verbs.add_parser("paper", help=text, description=text)
-    verb.add_argument("experiments", metavar="EXPERIMENT", nargs="*", help=f"{', '.join(EXPERIMENTS)} (default: all)")
+    whole = argparse.RawDescriptionHelpFormatter
+    names = f"experiments:\n{described()}"
+    verb = verbs.add_parser("paper", help=text, description=text, epilog=names, formatter_class=whole)
+    verb.add_argument("experiments", metavar="EXPERIMENT", nargs="*", help="one or more of those below (default: all)")
     verb.add_argument("--quick", action="store_true", help="a smaller form of each, minutes for all")
-    verb.add_argument("--seed", type=int, metavar="N", help="of all that is drawn (default: those of the scenes)")
+    verb.add_argument("--seed", metavar="N", help="of all that is drawn (default: those of the scenes)")
     _add_out(verb, "folder to write, new or empty (default: runs/paper, or the next free name)")
 
 
@@ -286,10 +288,14 @@ def _stress(given: argparse.Namespace) -> int:
 def _paper(given: argparse.Namespace) -> int:
     import shlex
 
+    from instrument.paper.experiments import announced, chosen, seed_of
+
+    seed = seed_of(given.seed)
+    show(announced(chosen(given.experiments), given.quick))  # before what takes seconds to load
     from instrument.paper.command import paper
 
     command = shlex.join(["instrument", *given.words])
-    done = paper(given.experiments, given.quick, given.seed, given.out, show, given.force, command)
+    done = paper(given.experiments, given.quick, seed, given.out, show, given.force, command)
     return DONE if done else FELL_SHORT
 
 

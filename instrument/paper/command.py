@@ -8,17 +8,16 @@ from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
-from instrument.errors import InputError, unused_ledger
+from instrument.errors import unused_ledger
 from instrument.memory import high_water
-from instrument.numbers import brief
 from instrument.paper.bench import Bench
-from instrument.paper.experiments import EXPERIMENTS, chosen, experiment, seconds
-from instrument.paper.finding import NOT, Finding, verdict
+from instrument.paper.experiments import EXPERIMENTS, WORDS, chosen, experiment, seconds, seed_of
+from instrument.paper.finding import NOT, Finding, tally, verdict
 from instrument.paper.page import page
 from instrument.pipeline.folder import RunFolder
 from instrument.pipeline.progress import progress_bar
 from instrument.pipeline.record import json_text, versions
-from instrument.report.page import FigureEntry, duration, number, write_page
+from instrument.report.page import FigureEntry, duration, write_page
 from instrument.whole_file import write_ecsv
 
 
@@ -53,15 +52,14 @@ def paper(
     for a name that is none, or a seed below 1.
     """
     every = chosen(names)
-    if seed is not None and not 1 <= seed < 2**31:
-        raise InputError(f"--seed {brief(seed)}: give 1 to 2147483647, or leave it out for the seeds of the scenes")
+    seed = seed_of(seed)
     outcomes: list[Outcome] = []
     due = {name: seconds(name, quick) for name in every}
     stopped: BaseException | None = None
     with RunFolder("-".join(["paper", *names]), out, force) as folder, progress_bar("paper") as bar, unused_ledger():
-        show(announced(due, quick))
         for k, name in enumerate(every):
             bar(sum(due[n] for n in every[:k]) / sum(due.values()), name)
+            show(f"{k + 1} of {len(every)}        {name}, about {duration(due[name])}")
             bench = Bench(folder.partial / name, quick, seed)
             try:
                 outcomes.append(_outcome(name, bench))
@@ -74,7 +72,7 @@ def paper(
             show("\n".join(lines(outcomes[-1])))
         what = record(outcomes, quick, seed, command) | {"not_run": every[len(outcomes) :]}
         for one in outcomes:
-            write_ecsv(table(one.findings), folder.partial / f"{one.name}.ecsv")
+            write_ecsv(table(one, what), folder.partial / f"{one.name}.ecsv")
         left = f"Not run: {', '.join(what['not_run'])}.\n\n" if stopped else ""
         (folder.partial / "paper.md").write_text(left + markdown(outcomes), encoding="utf-8")
         write_page(page(outcomes, what), folder.partial / "paper.html")
@@ -86,15 +84,6 @@ def paper(
             show(f"of {len(every)} experiments {len(outcomes)} ended; not {', '.join(what['not_run'])}")
             raise stopped
     return not any(f.agreement == NOT for one in outcomes for f in one.findings)
-
-
-def announced(due: dict[str, float], quick: bool) -> str:
-    """What will be done, and in about what time."""
-    longest = max(due, key=lambda name: due[name])
-    what = f"{len(due)} experiments, '{longest}' {duration(due[longest])} of it" if len(due) > 1 else f"'{longest}'"
-    return (
-        f"paper         {'quick' if quick else 'full'} form, about {duration(sum(due.values()))} on two cores: {what}"
-    )
 
 
 def _outcome(name: str, bench: Bench) -> Outcome:
@@ -112,10 +101,9 @@ def lines(one: Outcome) -> list[str]:
     out = [f"{one.name}: {EXPERIMENTS[one.name][1]}"]
     wide = max((len(f.what) for f in one.findings), default=0)
     for f in one.findings:
-        ours = f"{number(f.ours)} {f.unit}".strip()
         paper = f"paper: {f.asked}" if f.asked else ""
-        out.append(f"  {f.what:<{wide}}  {ours:<14} {paper:<38} {f.agreement}".rstrip())
-        out += [f"      {text}" for text in (f.because, f.since) if text]
+        out.append(f"  {f.what:<{wide}}  {f.value:<14} {paper:<38} {f.agreement}".rstrip())
+        out += [f"      {text}" for text in f.why]
     return [*out, f"{one.name}: {one.verdict} ({one.seconds:.0f} s)"]
 
 
@@ -127,39 +115,70 @@ def record(outcomes: Sequence[Outcome], quick: bool, seed: int | None, command: 
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": command,
         "form": "quick" if quick else "full",
-        "seed": seed,
+        "seed": "those of the scenes" if seed is None else seed,
         "versions": versions(),
         "numbers": {one.name: {f.what: f.ours for f in one.findings} for one in outcomes},
+        "paper": {one.name: {f.what: _printed(f) for f in one.findings if f.within} for one in outcomes},
         "verdicts": {one.name: one.verdict for one in outcomes},
         "seconds": {one.name: round(one.seconds, 2) for one in outcomes},
         "memory": {one.name: one.peak_bytes for one in outcomes},
     }
 
 
-def table(findings: Sequence[Finding]) -> Any:
-    """Findings as an astropy table."""
+def _printed(f: Finding) -> dict[str, Any]:
+    """What the paper has of a number; a range without an upper end has None there."""
+    assert f.within is not None
+    return {"printed": f.paper, "low": f.within[0], "high": f.within[1], "agreement": f.agreement}
+
+
+COLUMNS = {
+    "what": "the number; the key of run.json",
+    "ours": "what was found, all digits",
+    "unit": "of ours, low, high and changed",
+    "paper": "what the paper prints",
+    "low": "least value that is taken to be the paper's; of a slip, that is right by other means",
+    "high": "largest such value",
+    "asked": "paper, low and high in words",
+    "changed": "ours with the one thing changed that `because` names; of a slip, what the printed form gives",
+    "slip": "whether the paper's is held to be a slip",
+    "agreement": "the verdict; empty where the paper has no such number",
+    "because": "the reason of a difference",
+    "since": "what others have found, and remarks",
+    "end": "where ours is a lower limit: what ends there",
+    "kept": "of a doubtful slip: what follows the printed number all the same",
+}
+
+
+def table(one: Outcome, what: dict[str, Any]) -> Any:
+    """Findings of an experiment as an astropy table that says where it is from; `what` is the record of the run."""
     from astropy.table import Table
 
-    low, high = ([float("nan") if f.within is None else f.within[k] for f in findings] for k in (0, 1))
-    columns = {key: [getattr(f, key) for f in findings] for key in ("what", "ours", "unit", "paper")}
-    told = ("asked", "changed", "slip", "agreement", "because", "since")
-    last = {key: [getattr(f, key) for f in findings] for key in told}
-    return Table({**columns, "low": low, "high": high, **last})
+    ends = [f.within or (float("nan"),) * 2 for f in one.findings]
+    limits = {"low": [low for low, _ in ends], "high": [high for _, high in ends]}
+    out = Table({key: limits.get(key) or [getattr(f, key) for f in one.findings] for key in COLUMNS})
+    for key, text in COLUMNS.items():
+        out[key].description = text
+    out.meta |= {"experiment": one.name, "title": EXPERIMENTS[one.name][1], "verdict": one.verdict}
+    out.meta |= {key: what[key] for key in ("form", "seed", "command")}
+    return out
 
 
 def markdown(outcomes: Sequence[Outcome]) -> str:
     """The tables of all experiments."""
-    parts = []
+    parts = [tally([f for one in outcomes for f in one.findings]) + ".\n"]
     for one in outcomes:
         title, where = EXPERIMENTS[one.name][1:]
-        body = "".join(_row(f) for f in one.findings)
+        body = "".join(row(f) for f in one.findings)
+        said = f"{one.verdict[0].upper()}{one.verdict[1:]}"
+        words = f"{WORDS[one.name]}\n\n" if one.name in WORDS else ""
         parts.append(
-            f"### `{one.name}`: {title}\n\nThe paper's {where}. **{one.verdict[0].upper()}{one.verdict[1:]}.**\n\n"
+            f"### `{one.name}`: {title}\n\nThe paper's {where}. **{said}.**\n\n{words}"
             f"| | ours | the paper | |\n|---|---|---|---|\n{body}"
         )
     return "\n".join(parts)
 
 
-def _row(f: Finding) -> str:
-    said = "; ".join(text for text in (f.agreement, f.because, f.since) if text)
-    return f"| {f.what} | {number(f.ours)} {f.unit} | {f.asked} | {said} |\n".replace("  ", " ")
+def row(f: Finding) -> str:
+    """A number as a row of a table in Markdown."""
+    said = "; ".join(text for text in (f.agreement, *f.why) if text)
+    return f"| {f.what} | {f.value} | {f.asked} | {said} |\n".replace("  ", " ")

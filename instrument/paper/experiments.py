@@ -31,6 +31,17 @@ SECONDS = {
     "aw-correction": (44, 632), "galactic": (25, 709), "gmca": (20, 64), "whole-way": (24, 131), "ixr": (5, 7),
     "errata": (6, 5),
 }  # fmt: skip
+# what one must know to read the rows
+WORDS = {
+    "di-errors": (
+        "S, IQ, UV, IU, QU, IV and QV are the seven sums of gain and feed errors of a baseline that fill its Mueller "
+        "matrix to first order: S scales all four Stokes parameters, IQ mixes I and Q, UV mixes U and V, and so on; "
+        "each is the rms over baselines and intervals of what calibration left of it, in % of the rms of the errors "
+        'put in. "As in the paper" reads them off the Mueller matrix of the differences of Jones matrices, true less '
+        'solved, of two stations, and is of second order in them; "by definition (linear)" forms them of the '
+        "differences themselves: docs/calibrating.md."
+    ),
+}
 NEW = 10  # of one that nobody has timed
 
 
@@ -42,9 +53,45 @@ def seconds(name: str, quick: bool) -> float:
 def chosen(names: Sequence[str]) -> list[str]:
     """The names asked for, or all; raises `InputError` for one that is none."""
     for name in names:
+        parts = [part.strip().lower() for part in name.split(",")]
+        if len(parts) > 1 and set(parts) <= {*EXPERIMENTS, ""}:
+            raise InputError(f"'{name}': separate experiments by spaces: {' '.join(part for part in parts if part)}")
         if name not in EXPERIMENTS:
             raise InputError(f"no experiment is called '{name}': {did_you_mean(name, EXPERIMENTS)}")
     return list(dict.fromkeys(names)) or list(EXPERIMENTS)
+
+
+def seed_of(given: str | int | None) -> int | None:
+    """The seed asked for, which may be None; raises `InputError` for one that is none."""
+    if given is None:
+        return None
+    try:
+        seed = int(given)
+    except ValueError:
+        seed = 0
+    if not 1 <= seed < 2**31:
+        from instrument.numbers import brief
+
+        shown = given if isinstance(given, str) and given.isdigit() else brief(given)
+        raise InputError(f"--seed {shown}: give 1 to 2147483647, or leave it out for the seeds of the scenes")
+    return seed
+
+
+def announced(names: Sequence[str], quick: bool) -> str:
+    """What will be done, and in about what time."""
+    from instrument.report.page import duration
+
+    due = {name: seconds(name, quick) for name in names}
+    longest = max(due, key=lambda name: due[name])
+    what = f"{len(due)} experiments, '{longest}' {duration(due[longest])} of it" if len(due) > 1 else f"'{longest}'"
+    form = "quick" if quick else "full"
+    return f"paper         {form} form, about {duration(sum(due.values()))} on two cores: {what}"
+
+
+def described() -> str:
+    """The experiments, a line each."""
+    wide = max(map(len, EXPERIMENTS))
+    return "\n".join(f"  {name:<{wide}}  {title}" for name, (_, title, _) in EXPERIMENTS.items())
 
 
 def experiment(name: str) -> Experiment:

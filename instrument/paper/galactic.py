@@ -67,12 +67,13 @@ def run(bench: Bench) -> list[Finding]:
     give_back()
     found = _seen(noisy, reach)
     inner = _seen(_inner(noisy), reach)
+    field_deg = float(np.rad2deg(noisy.pixel_rad) * noisy.data.shape[-1])
     signal = Signal21cm.table()
     bench.draw("window", cylinder_ratio(found.window), "Leakage over signal, with the noise of a night in Q and U.")
     bench.draw("ratio", _shares({"noise in Q and U": found, "without": quiet}), "What of P is in I, over k_par.")
     drawn = {"leaked, with noise in Q and U": found.sphere, "leaked, without": quiet.sphere}
     bench.draw("spherical", spheres(drawn, [signal]), "Leakage into I beside the 21-cm signal.")
-    return [*depths, *_ratios(found, inner, circular), *_windows(found, quiet, signal)]
+    return [*depths, *_ratios(found, inner, circular), *_windows(found, quiet, signal, field_deg)]
 
 
 def _depths(bench: Bench, kelvin: StokesCube) -> list[Finding]:
@@ -134,35 +135,47 @@ def _ratios(found: Seen, inner: Seen, circular: float) -> list[Finding]:
     ]  # fmt: skip
 
 
-def _windows(found: Seen, quiet: Seen, signal: Signal21cm) -> list[Finding]:
-    """Where the signal is above the leakage."""
-    _, top = found.window.reach()
-    _, more = found.window.reach(0.7)
-    nyquist = float(found.leak.par_edges[-1])
-    over = [_excess(seen.sphere, seen.sphere.delta2, signal) for seen in (found, quiet)]
+def _windows(found: Seen, quiet: Seen, signal: Signal21cm, field_deg: float) -> list[Finding]:
+    """Where the signal is above the leakage; a number at the end of its axis is a lower limit, and says so."""
+    nyquist, last = float(found.leak.par_edges[-1]), float(found.sphere.edges[-1])
+    top, more, calm = found.window.reach()[1], found.window.reach(0.7)[1], quiet.window.reach()[1]
+    over, silent = (_excess(seen.sphere, seen.sphere.delta2, signal) for seen in (found, quiet))
     louder = _louder(found.sphere, quiet.sphere, signal)
+    parallel = f"all k_par measured, {nyquist:.3g} /Mpc is Nyquist"
+    every = f"all k measured, {last:.3g} /Mpc is the largest"
+    ours = f"it is {over:.2f}" if over < last else f"ours stays below it at all k measured, up to {last:.2f}"
     return [
         # bins are a factor of 1.3 wide in k_par; the channels of the quick form end at 0.37, and cannot tell
-        Finding("window open up to k_par", top, "/Mpc", "about 0.5", _told((0.35, 0.7), nyquist)),
-        Finding("the same, 70 % of the leakage removed", more, "/Mpc", "about 1", _told((0.8, 1.0), nyquist)),
+        Finding("window open up to k_par", top, "/Mpc", "about 0.5", _told((0.35, 0.7), nyquist, 0.42),
+                end=_end(top, nyquist, parallel)),
+        # "about 1" is where the paper's channels end too (slip 7): open up to there
+        Finding("the same, 70 % of the leakage removed", more, "/Mpc", "about 1", _told((0.8, np.inf), nyquist, 0.84),
+                end=_end(more, nyquist, parallel)),
         Finding(
-            "k up to which the spherical leakage is below the signal",
-            over[0],
+            f"k up to which the spherical leakage is below the signal, field of {field_deg:.2g} deg",
+            over,
             "/Mpc",
             "0.3",
             (0.2, 0.4),
-            f"noise in Q and U of {louder:.1f} times that of the night of Table 2 would make it 0.3; that the paper's "
-            "Q and U, images of real data, have so much is not known",
+            f"the paper has it below at k < 0.3 within 4 deg: that is read as a crossing, or 0.3 would say nothing; "
+            f"{ours}; noise in Q and U of {louder:.1f} times that of the night of Table 2 would make it 0.3; that the "
+            "paper's Q and U, images of real data, have so much is not known",
+            end=_end(over, last, every),
         ),
-        Finding("the same without noise in Q and U", over[1], "/Mpc"),
-        Finding("window open up to k_par, without noise in Q and U", quiet.window.reach()[1], "/Mpc"),
+        Finding("the same without noise in Q and U", silent, "/Mpc", end=_end(silent, last, every)),
+        Finding("window open up to k_par, without noise in Q and U", calm, "/Mpc", end=_end(calm, nyquist, parallel)),
         Finding("share of the window's bins that are open", 100 * found.window.area()[1], "%"),
-    ]
+    ]  # fmt: skip
 
 
-def _told(within: tuple[float, float], nyquist: float) -> tuple[float, float] | None:
-    """A range, or none where channels end below it and cannot tell."""
-    return within if nyquist > within[0] + 0.2 * (within[1] - within[0]) else None
+def _told(within: tuple[float, float], nyquist: float, least: float) -> tuple[float, float] | None:
+    """A range, or none where channels end too early to tell."""
+    return within if nyquist > least else None
+
+
+def _end(value: float, last: float, text: str) -> str:
+    """What ends the axis, where a value is at its end."""
+    return text if value >= last * (1 - 1e-9) else ""
 
 
 def _seen(cube: StokesCube, reach: tuple[float, float]) -> Seen:

@@ -16,7 +16,7 @@ MISSED = {
     "galactic": {
         "I at Faraday depth 0 over I at that of P, power",  # 0.43: the bright place of so small a mock decides
         "peak of the leakage for 5 K of P, inside half power",  # 9.1 mK, in channels and pixels that are coarse
-        "k up to which the spherical leakage is below the signal",  # 3.5 times the noise is asked
+        "k up to which the spherical leakage is below the signal, field of 4 deg",  # 3.5 times the noise is asked
     },
     "gmca": {"power below k_par 0.06 /Mpc before over after, quiet"},  # 21; 50 with all channels and pixels
     "aw-correction": {"leakage removed, the best source, normalised"},  # more than the paper's 80 %

@@ -11,7 +11,7 @@ from instrument.cli import main
 from instrument.paper import command, ixr
 from instrument.paper.bench import Bench
 from instrument.paper.experiments import EXPERIMENTS, SECONDS, experiment
-from instrument.paper.finding import AGREES, CORRECTED, DIFFERS, MORE, NOT, Finding, verdict
+from instrument.paper.finding import AGREES, CORRECTED, DIFFERS, DOUBTFUL, MORE, NOT, Finding, tally, verdict
 from instrument.paper.patch import around, rings, square
 from instrument.units import Direction
 
@@ -38,7 +38,40 @@ def test_a_reason_that_does_not_lead_into_the_range_is_none(changed):
 def test_a_slip_is_one_where_ours_is_right_and_the_printed_form_is_not():
     assert SLIP.agreement == CORRECTED
     assert [SLIP._replace(**x).agreement for x in ({"ours": 9.5}, {"changed": 9.3}, {"changed": np.nan})] == [NOT] * 3
-    assert verdict([SLIP, BEYOND]) == "what is printed is not what is right, in 1 of 1 numbers"
+    assert verdict([SLIP, BEYOND]) == "1 slip, 1 number: in 1 what is printed is not what is right"
+
+
+def test_a_slip_that_is_kept_is_a_doubt_and_numbers_of_one_slip_are_one():
+    two, one = [SLIP._replace(what=what) for what in ("5. width", "5. height")], SLIP._replace(what="6. depth")
+    doubt = SLIP._replace(what="13. count", kept="the mock follows the paper")
+    assert doubt.agreement == DOUBTFUL and doubt.why[-1] == "the mock follows the paper"
+    assert doubt._replace(ours=9.5).agreement == NOT
+    said = "3 slips, 4 numbers: in 3 what is printed is not what is right, in 1 it is doubtful and kept"
+    assert verdict([*two, one, doubt, BEYOND]) == said
+    mixed = verdict([SOUND, *two, one, doubt])
+    assert mixed == "reproduced, 3 of 5 by what the paper should have, 1 of 5 doubtful and kept"
+
+
+def test_the_last_value_of_an_axis_is_a_lower_limit_and_agrees_only_without_an_upper_end():
+    last = Finding("reach", 0.9, "/Mpc", "about 1", (0.8, 1.0), end="Nyquist")
+    assert last._replace(end="").agreement == AGREES and last.agreement == NOT
+    assert last._replace(within=(0.8, np.inf)).agreement == AGREES
+    assert last._replace(within=(1.0, np.inf)).agreement == NOT
+    assert last.value == "at least 0.900 /Mpc" and last.why == ["the end of what was measured: Nyquist"]
+
+
+def test_a_value_has_the_digits_that_show_on_which_side_it_lies():
+    small = Finding("leakage", 0.0020031, "%", "< 0.002", (0.0, 0.002))
+    assert (small.agreement, small.value) == (NOT, "0.002003 %")
+    assert small._replace(ours=0.0019996, within=(0.002, 1.0)).value == "0.0019996 %"
+    assert small._replace(ours=0.0123456).value == "0.0123 %" and small._replace(ours=float("nan")).value == "– %"
+
+
+def test_the_tally_counts_every_verdict():
+    assert tally([SOUND, WHY, SLIP, SLIP, BEYOND]) == (
+        "4 numbers of the paper: 1 reproduced, 1 different for a reason, 2 corrected as slips, 0 not reproduced"
+    )
+    assert tally([MISSED]) == "1 number of the paper: 1 not reproduced"
 
 
 def test_the_verdict_is_that_of_the_worst_number():
@@ -82,14 +115,21 @@ def test_a_folder_has_the_record_the_tables_the_text_and_the_page(tmp_path, scri
     assert what["numbers"] == {"one": {"width": 3.8, "length": 129.0}, "two": {"depth": 7.0}}
     assert (what["form"], what["seed"]) == ("quick", 5) and what["memory"]["two"] > 1e7
     assert what["command"].startswith("instrument paper one two one --quick")
+    assert what["paper"]["one"]["width"] == {"printed": "3.8", "low": 3.7, "high": 3.9, "agreement": AGREES}
+    assert what["paper"]["two"] == {}
     table = Table.read(tmp_path / "p" / "one.ecsv")
+    keys = ("experiment", "form", "seed", "command")
+    assert [table.meta[key] for key in keys] == ["one", "quick", 5, what["command"]]
+    assert all(table[name].description for name in table.colnames)
     assert list(table["agreement"]) == [AGREES, DIFFERS] and table["low"][1] == 126.5
     assert np.isnan(Table.read(tmp_path / "p" / "two.ecsv")["high"][0])
     text = (tmp_path / "p" / "paper.md").read_text()
     assert "### `one`: title of one" in text and "| width | 3.80 deg | 3.8 (3.7 to 3.9) | agrees |" in text
     assert "| length | 129 m | 127 (126.5 to 127.5) | differs, for a reason; by survey 129.0 m; 130 m |" in text
     page = (tmp_path / "p" / "paper.html").read_text()
-    assert "Every number is reproduced" in page and "by survey 129.0 m" in page and "A line." in page
+    assert "2 numbers of the paper: 1 reproduced, 1 different for a reason, 0 not reproduced." in page
+    assert "instrument paper one two --quick --seed 5</pre>" in page and 'class="stack"' in page
+    assert "by survey 129.0 m" in page and "A line." in page
     assert (tmp_path / "p" / "one" / "line.png").stat().st_size > 1000
 
 
@@ -105,7 +145,8 @@ def test_what_has_ended_is_kept_where_an_experiment_fails(tmp_path, scripted, mo
     said = []
     with pytest.raises(type(error)):
         command.paper(["one", "two", "three"], out=str(tmp_path / "p"), show=said.append)
-    assert said[-1] == "of 3 experiments 1 ended; not two, three" and "3 experiments" in said[0]
+    assert said[-1] == "of 3 experiments 1 ended; not two, three" and said[0].startswith("1 of 3        one, about")
+    assert json.loads((tmp_path / "p" / "run.json").read_text())["seed"] == "those of the scenes"
     assert json.loads((tmp_path / "p" / "run.json").read_text())["not_run"] == ["two", "three"]
     assert (tmp_path / "p" / "one.ecsv").exists() and not (tmp_path / "p" / "two").exists()
     page = (tmp_path / "p" / "paper.html").read_text()
@@ -129,7 +170,8 @@ def test_a_number_that_is_not_reproduced_is_status_3(tmp_path, scripted, capsys)
     scripted(one=[MISSED])
     assert main(["paper", "one", "--out", str(tmp_path / "p")]) == 3
     assert "one: 1 of 1 not reproduced: leakage" in capsys.readouterr().out
-    assert "1 of 1 not reproduced" in (tmp_path / "p" / "paper.html").read_text()
+    page = (tmp_path / "p" / "paper.html").read_text()
+    assert "1 number of the paper: 1 not reproduced." in page and '<pre tabindex="0">instrument paper one</pre>' in page
 
 
 def test_two_folders_are_compared(tmp_path, scripted, capsys):
@@ -150,16 +192,24 @@ def test_an_unknown_experiment_is_one_line_and_leaves_nothing(tmp_path, capsys, 
     assert not list(tmp_path.iterdir())
 
 
-def test_a_seed_that_would_be_none_is_refused(tmp_path, capsys):
-    assert main(["paper", "ixr", "--seed", "0", "--out", str(tmp_path / "p")]) == 2
-    assert capsys.readouterr().err.count("--seed 0: give 1 to 2147483647") == 1
+@pytest.mark.parametrize(("seed", "shown"), [("0", "0"), ("x", "'x'"), ("1.5", "'1.5'"), ("2147483648", "2147483648")])
+def test_a_seed_that_is_none_is_refused(tmp_path, capsys, seed, shown):
+    assert main(["paper", "ixr", "--seed", seed, "--out", str(tmp_path / "p")]) == 2
+    assert capsys.readouterr().err.count(f"--seed {shown}: give 1 to 2147483647") == 1
     assert not list(tmp_path.iterdir())
 
 
-def test_its_help_lists_the_experiments(capsys):
+def test_experiments_with_commas_between_them_are_told_apart(capsys):
+    assert main(["paper", "Beam,ixr"]) == 2
+    assert "'Beam,ixr': separate experiments by spaces: beam ixr" in capsys.readouterr().err
+
+
+def test_its_help_has_a_line_for_each_experiment(capsys):
     assert main(["paper", "--help"]) == 0
-    text = "".join(capsys.readouterr().out.split())  # lines break at hyphens too
-    assert f"{','.join(EXPERIMENTS)}(default:all)" in text
+    lines = capsys.readouterr().out.splitlines()
+    assert all(
+        any(line.split() == [name, *title.split()] for line in lines) for name, (_, title, _) in EXPERIMENTS.items()
+    )
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
