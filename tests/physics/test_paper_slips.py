@@ -5,7 +5,7 @@ import pytest
 
 from instrument.paper import errata
 from instrument.paper.bench import Bench
-from instrument.paper.finding import CORRECTED, NOT, near, slip
+from instrument.paper.finding import CORRECTED, DOUBTFUL, NOT, near, slip
 
 
 @pytest.mark.long
@@ -13,7 +13,9 @@ def test_every_slip_is_shown_to_be_one(tmp_path):
     every = errata.run(Bench(tmp_path, quick=True))
     found = {f.what: f for f in every}
     assert len(found) == len(every)  # run.json has them by name
-    assert {f.agreement for f in found.values() if f.within} == {CORRECTED}
+    said = {f.what: f.agreement for f in found.values() if f.within}
+    assert said.pop("13. within 5 deg by published counts, sources above 27 mJy") == DOUBTFUL  # the mock follows it
+    assert set(said.values()) == {CORRECTED}
     assert {int(what.split(".")[0]) for what in found} == set(range(1, 14))
     ours = {what.split(".")[0]: f.ours for what, f in found.items()}
     assert ours["7"] == pytest.approx(0.913 * 160 / 161, rel=2e-3)  # Nyquist, where 161 channels have their last delay
