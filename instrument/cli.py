@@ -98,9 +98,8 @@ def _add_paper(verbs: Any) -> None:
     from instrument.paper.experiments import described
 
     text = "Run what Asad et al. (2015) did: the paper's numbers, ours, and why they differ."
-    whole = argparse.RawDescriptionHelpFormatter
-    names = f"experiments:\n{described()}"
-    verb = verbs.add_parser("paper", help=text, description=text, epilog=names, formatter_class=whole)
+    layout: Any = {"epilog": f"experiments:\n{described()}", "formatter_class": argparse.RawDescriptionHelpFormatter}
+    verb = verbs.add_parser("paper", help=text, description=text, **layout)
     verb.add_argument("experiments", metavar="EXPERIMENT", nargs="*", help="one or more of those below (default: all)")
     verb.add_argument("--quick", action="store_true", help="a smaller form of each, minutes for all")
     verb.add_argument("--seed", metavar="N", help="of all that is drawn (default: those of the scenes)")
@@ -290,13 +289,13 @@ def _paper(given: argparse.Namespace) -> int:
 
     from instrument.paper.experiments import announced, chosen, seed_of
 
-    seed = seed_of(given.seed)
+    given.seed = seed_of(given.seed)
     show(announced(chosen(given.experiments), given.quick))  # before what takes seconds to load
     from instrument.paper.command import paper
 
-    command = shlex.join(["instrument", *given.words])
-    done = paper(given.experiments, given.quick, seed, given.out, show, given.force, command)
-    return DONE if done else FELL_SHORT
+    words = shlex.join(["instrument", *given.words])
+    right = paper(given.experiments, given.quick, given.seed, given.out, show, given.force, words)
+    return DONE if right else FELL_SHORT
 
 
 def _scenes(given: argparse.Namespace) -> int:
