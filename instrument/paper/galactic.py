@@ -137,11 +137,12 @@ def _ratios(found: Seen, inner: Seen, circular: float) -> list[Finding]:
 
 def _windows(found: Seen, quiet: Seen, signal: Signal21cm, field_deg: float) -> list[Finding]:
     """Where the signal is above the leakage; a number at the end of its axis is a lower limit, and says so."""
-    nyquist, last = float(found.leak.par_edges[-1]), float(found.sphere.edges[-1])
+    nyquist, last = _highest(found.window), float(found.sphere.edges[-1])
     top, more, calm = found.window.reach()[1], found.window.reach(0.7)[1], quiet.window.reach()[1]
     over, silent = (_excess(seen.sphere, seen.sphere.delta2, signal) for seen in (found, quiet))
     louder = _louder(found.sphere, quiet.sphere, signal)
-    parallel = f"all k_par measured, {nyquist:.3g} /Mpc is Nyquist"
+    whose = "Nyquist" if nyquist == found.window.leakage.par_edges[-1] else "the largest that counts"
+    parallel = f"all k_par measured, {nyquist:.3g} /Mpc is {whose}"
     every = f"all k measured, {last:.3g} /Mpc is the largest"
     ours = f"it is {over:.2f}" if over < last else f"ours stays below it at all k measured, up to {last:.2f}"
     return [
@@ -171,6 +172,11 @@ def _windows(found: Seen, quiet: Seen, signal: Signal21cm, field_deg: float) -> 
 def _told(within: tuple[float, float], nyquist: float, least: float) -> tuple[float, float] | None:
     """A range, or none where channels end too early to tell."""
     return within if nyquist > least else None
+
+
+def _highest(window: EoRWindow) -> float:
+    """The upper edge of the last row of bins that count: the window cannot reach further."""
+    return float(window.leakage.par_edges[1:][window.counts.any(axis=0)][-1])
 
 
 def _end(value: float, last: float, text: str) -> str:

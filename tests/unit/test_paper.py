@@ -1,6 +1,7 @@
 """`instrument paper`: verdicts, tables, the page, two folders compared; the experiment `ixr` whole."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from instrument.paper import command, ixr
 from instrument.paper.bench import Bench
 from instrument.paper.experiments import EXPERIMENTS, SECONDS, experiment
 from instrument.paper.finding import AGREES, CORRECTED, DIFFERS, DOUBTFUL, MORE, NOT, Finding, tally, verdict
+from instrument.paper.galactic import Seen, _windows
 from instrument.paper.patch import around, rings, square
 from instrument.units import Direction
 
@@ -58,6 +60,29 @@ def test_the_last_value_of_an_axis_is_a_lower_limit_and_agrees_only_without_an_u
     assert last._replace(within=(0.8, np.inf)).agreement == AGREES
     assert last._replace(within=(1.0, np.inf)).agreement == NOT
     assert last.value == "at least 0.900 /Mpc" and last.why == ["the end of what was measured: Nyquist"]
+
+
+def test_windows_that_reach_the_last_bins_say_that_they_are_limits():
+    edges = np.array([0.1, 0.3, 0.6, 0.9, 1.2])
+    counts = np.array([[True, True, True, False]] * 2)  # nothing counts above 0.9
+
+    def seen(reach, below):
+        window = SimpleNamespace(
+            leakage=SimpleNamespace(par_edges=edges), counts=counts, reach=lambda removed=0: (0.1, reach[removed > 0]),
+            area=lambda: (1.0, 0.5),
+        )  # fmt: skip
+        return Seen(None, None, SimpleNamespace(edges=edges, k=edges[:-1], delta2=1e-6 * np.array(below)), window)
+
+    signal = SimpleNamespace(delta2=np.ones_like)
+    quiet = seen((0.9, 0.9), [0, 0, 0, 0])
+    found = {f.what: f for f in _windows(seen((0.6, 0.9), [0.5] * 4), quiet, signal, 4.0)}
+    top, more = found["window open up to k_par"], found["the same, 70 % of the leakage removed"]
+    assert (top.end, more.value, more.agreement) == ("", "at least 0.900 /Mpc", AGREES)
+    sphere = found["k up to which the spherical leakage is below the signal, field of 4 deg"]
+    assert (sphere.value, sphere.agreement) == ("at least 1.20 /Mpc", NOT)
+    crossing = _windows(seen((0.6, 0.6), [0.5, 2, 2, 2]), quiet, signal, 4.0)
+    ours = [f for f in crossing if f.what == sphere.what]
+    assert (ours[0].value, ours[0].agreement, ours[0].end) == ("0.300 /Mpc", AGREES, "")
 
 
 def test_a_value_has_the_digits_that_show_on_which_side_it_lies():
