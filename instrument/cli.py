@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from instrument.errors import InputError, did_you_mean
+from instrument.pipeline.on_data import HELP, WRITES, tables_on
 from instrument.terminal import DONE, FAILED, FELL_SHORT, process, show, status_of
 
 
@@ -54,6 +55,8 @@ def parser() -> argparse.ArgumentParser:
     _add_out(run)
     run.add_argument("--no-verify", action="store_true", help="leave out the check against the direct sum")
     scene_verb("plan", "Say what would be done, left out, and at what cost; nothing is computed.")
+    for name, text in HELP.items():
+        _add_data(scene_verb(name, text), name)
     _add_analyze(verbs)
     text = "Say what changed between two run folders: scene, versions, checks, numbers, tables, spectra, costs."
     both = verbs.add_parser("compare", help=text, description=text)
@@ -92,6 +95,17 @@ def _add_out(verb: argparse.ArgumentParser, text: str = "") -> None:
     usual = "folder to write, new or empty (default: runs/NAME, or NAME-2, NAME-3, ... where that is taken)"
     verb.add_argument("--out", metavar="DIR", help=f"{text or usual}; nothing that is there is overwritten")
     verb.add_argument("--force", action="store_true", help="replace an earlier run in that folder")
+
+
+def _add_data(verb: argparse.ArgumentParser, name: str) -> None:
+    verb.add_argument("--data", metavar="SET.MS", required=True, help="the Measurement Set")
+    verb.add_argument("--column", default="DATA", metavar="COLUMN", help="of the visibilities (default: DATA)")
+    if name in WRITES:
+        verb.add_argument("--into", metavar="COLUMN", help=f"to write (default: {WRITES[name][1]})")
+    verb.add_argument("--window", type=int, metavar="N", help="spectral window, where the set has several")
+    verb.add_argument("--field", type=int, metavar="N", help="field, where the set has several")
+    verb.add_argument("--no-verify", action="store_true", help="leave out the check against the direct sum")
+    _add_out(verb)
 
 
 def _add_paper(verbs: Any) -> None:
@@ -183,7 +197,11 @@ def _scene_file(given: argparse.Namespace) -> Any:
     from instrument.pipeline.scene_file import parse
     from instrument.pipeline.scene_text import override, read_tables
 
-    tables = override(read_tables(given.scene), given.settings)
+    tables = read_tables(given.scene)
+    if "data" in given:
+        names = {"set": given.data, **{name: getattr(given, name) for name in ("column", "window", "field")}}
+        tables = tables_on(given.verb, tables, names, getattr(given, "into", None), given.force)
+    tables = override(tables, given.settings)
     for key in ("tolerance", "engine"):
         if getattr(given, key) is not None:
             tables[key] = getattr(given, key)
@@ -334,6 +352,7 @@ def _doctor(given: argparse.Namespace) -> int:
 
 VERBS = {
     "run": _run,
+    **dict.fromkeys(HELP, _run),
     "plan": _plan,
     "analyze": _analyze,
     "compare": _compare,

@@ -49,11 +49,11 @@ def whole_folder(path: str | os.PathLike[str], mark: str, overwrite: bool = Fals
     """
     target = Path(path)
     private: Path | None = None
-    _free_folder(target, mark, overwrite)
+    free_folder(target, mark, overwrite)
     try:
         private = Path(tempfile.mkdtemp(prefix=".partial-", dir=target.parent))
         yield private / target.name
-        _free_folder(target, mark, overwrite)
+        free_folder(target, mark, overwrite)
         if target.is_dir():
             old = target.rename(private / "old")
             try:
@@ -71,7 +71,8 @@ def whole_folder(path: str | os.PathLike[str], mark: str, overwrite: bool = Fals
             shutil.rmtree(private, ignore_errors=True)
 
 
-def _free_folder(target: Path, mark: str, overwrite: bool) -> None:
+def free_folder(target: Path, mark: str, overwrite: bool) -> None:
+    """Raise `InputError` where `whole_folder` would."""
     if not os.path.lexists(target):
         return
     if target.is_symlink() or not (target / mark).is_file():

@@ -19,14 +19,17 @@ from instrument.files.ms_rows import add_column, at_rows, filled, in_parts, put_
 from instrument.files.ms_tables import demand, opened, told
 from instrument.model import Instrument
 from instrument.observe.recorded import Recorded
+from instrument.observe.sampling import Sampling
 from instrument.store import Store
 from instrument.units import Float, Int
 from instrument.visibilities import Visibilities, VisibilitySet
 from instrument.visibility_sets import BLOCK_BYTES, VisibilityFile, as_set
-from instrument.whole_file import whole_folder
+from instrument.whole_file import free_folder, whole_folder
 
 SAME_RAD = 1e-9  # phase centres as near as this are one
 NEEDED = ("TIME", "INTERVAL", "ANTENNA1", "ANTENNA2", "DATA_DESC_ID", "FIELD_ID", "UVW", "FLAG")
+
+MARK = "table.dat"  # a file of every set
 
 
 @checked
@@ -90,6 +93,29 @@ class MeasurementSet(VisibilitySet):
             for times in self._steps():
                 yield self._block(table, times)
 
+    def part(self, block: Visibilities) -> Visibilities:
+        """The visibilities of the times and channels of another block; raises `InputError` where it has others."""
+        with opened(self.path) as table:
+            return self._block(table, *self._where(block))
+
+    def sampling(self, block: Visibilities) -> Sampling:
+        """The coordinates of the times and channels of another block, with the UVW of the set."""
+        times, channels = self._where(block)
+        with opened(self.path) as table:
+            return self._coordinates(table, times).at.block(slice(None), channels)
+
+    def _where(self, block: Visibilities) -> tuple[slice, slice]:
+        """Where the times and channels of a block are."""
+        found = []
+        asked = (block.at.slots_s, self.rows.slots_s, SAME_S, "times"), (block.freq_hz, self.freq_hz, 1.0, "channels")
+        for values, known, same, what in asked:
+            first = int(np.abs(known - values[0]).argmin())
+            step = slice(first, first + len(values))
+            if len(known[step]) < len(values) or np.abs(known[step] - values).max() > same:
+                raise InputError(f"the visibilities are of other {what} than {self.path}")
+            found.append(step)
+        return found[0], found[1]
+
     def _steps(self) -> list[slice]:
         return self.rows.steps(BLOCK_BYTES, len(self.freq_hz))
 
@@ -102,23 +128,32 @@ class MeasurementSet(VisibilitySet):
         fields, stay as they are, zero in a new column. Data are written, with the keywords of LOFAR on which beam has
         been taken out; weights and flags are not. Raises `InputError` for blocks that are of something else.
         """
-        with opened(self.path) as table:
-            if column in table.columns() and not overwrite:
-                raise InputError(f"{self.path} has a column {column}: name another one, or allow to overwrite it")
-        if column in NEEDED or column in ("TIME_CENTROID", "EXPOSURE", "WEIGHT", "SIGMA", "WEIGHT_SPECTRUM"):
-            raise InputError(f"{column} is no column for visibilities")
+        self.free_column(self.path, column, overwrite)
         place = Path(self.path).absolute().parent
         with tempfile.TemporaryDirectory(dir=place, prefix=f".{Path(self.path).name}.") as folder:
-            kept = Path(folder) / "blocks.h5"
-            as_set(blocks).save(kept)
-            self._same(store := Store(kept))
+            kept = _kept(blocks, Path(folder))
+            self._same(kept.store)
             with opened(self.path, writable=True) as table:
                 if column not in table.columns():
                     add_column(table, column, self.column)
-                for block in VisibilityFile(kept).blocks():
+                for block in kept.blocks():
                     self._put(table, column, block)
                 with told(f"column {column}"):
-                    table.putcolkeywords(column, beam_words(store.beam_state))
+                    table.putcolkeywords(column, beam_words(kept.store.beam_state))
+
+    @staticmethod
+    def free_column(path: str, column: str, overwrite: bool) -> None:
+        """Raise `InputError` for a column that may not be written, or is there without `overwrite`."""
+        with opened(path) as table:
+            if column in table.columns() and not overwrite:
+                raise InputError(f"{path} has a column {column}: name another one, or allow to overwrite it (--force)")
+        if column in NEEDED or column in ("TIME_CENTROID", "EXPOSURE", "WEIGHT", "SIGMA", "WEIGHT_SPECTRUM"):
+            raise InputError(f"{column} is no column for visibilities")
+
+    @staticmethod
+    def free(path: str, overwrite: bool) -> None:
+        """Raise `InputError` where a new set may not stand."""
+        free_folder(Path(path), MARK, overwrite)
 
     @classmethod
     def create(
@@ -136,11 +171,8 @@ class MeasurementSet(VisibilitySet):
         whole or not there; one that is there is replaced with `overwrite` only. Raises `InputError` for other folders
         of that name, `FileError` where nothing can be written.
         """
-        with whole_folder(path, "table.dat", overwrite) as partial:
-            kept = blocks if isinstance(blocks, VisibilityFile) else None
-            if kept is None:
-                as_set(blocks).save(partial.with_suffix(".h5"))
-                kept = VisibilityFile(partial.with_suffix(".h5"))
+        with whole_folder(path, MARK, overwrite) as partial:
+            kept = _kept(blocks, partial.parent)
             ms_create.make(str(partial), kept.store, instrument)
             for block in kept.blocks():
                 ms_create.put(str(partial), block, kept.store)
@@ -155,26 +187,32 @@ class MeasurementSet(VisibilitySet):
         if "complex" not in kind:
             raise InputError(f"{self.path}: column {self.column} holds {kind}, not visibilities")
 
-    def _block(self, table: Any, times: slice) -> Visibilities:
+    def _block(self, table: Any, times: slice, channels: slice = slice(None)) -> Visibilities:
         where, numbers = self._coordinates(table, times), self.rows.of(times)
-        flags = self._cube(table, "FLAG", numbers).astype(bool)
+        frame = self.frame.of(channels)
+        where = where._replace(at=where.at.block(slice(None), channels))
+        flags = self._cube(table, "FLAG", numbers, channels).astype(bool)
         if "FLAG_ROW" in table.columns():
             flags = flags | at_rows(table, "FLAG_ROW", numbers).astype(bool)[:, None, None]
-        data, weight = self._cube(table, self.column, numbers), self._weight(table, numbers)
-        return block_of(self.frame, self.rows, times, where, data, flags, weight, self.beam_state)
+        data = self._cube(table, self.column, numbers, channels)
+        weight = self._weight(table, numbers, channels)
+        return block_of(frame, self.rows, times, where, data, flags, weight, self.beam_state)
 
-    def _cube(self, table: Any, name: str, numbers: Int) -> Any:
+    def _cube(self, table: Any, name: str, numbers: Int, channels: slice = slice(None)) -> Any:
         """Values (N, F, n) of a column, channels ascending."""
-        values = at_rows(table, name, numbers)
-        want = (len(numbers), len(self.frame.freq_hz), len(self.frame.kinds))
+        count = len(self.frame.freq_hz)
+        first, last, _ = channels.indices(count)
+        inside = slice(count - last, count - first) if self.frame.backwards else slice(first, last)
+        values = at_rows(table, name, numbers, None if last - first == count else inside)
+        want = (len(numbers), last - first, len(self.frame.kinds))
         if values.shape != want:
             raise FileError(f"{self.path}: {name} has shape {values.shape}, channels and correlations need {want}")
         return values[:, ::-1] if self.frame.backwards else values
 
-    def _weight(self, table: Any, numbers: Int) -> Float:
-        shape = (len(numbers), len(self.frame.freq_hz), len(self.frame.kinds))
+    def _weight(self, table: Any, numbers: Int, channels: slice) -> Float:
+        shape = (len(numbers), len(self.frame.freq_hz[channels]), len(self.frame.kinds))
         if self.weights == "WEIGHT_SPECTRUM":
-            values = self._cube(table, self.weights, numbers)
+            values = self._cube(table, self.weights, numbers, channels)
         elif self.weights == "WEIGHT":
             values = np.broadcast_to(at_rows(table, "WEIGHT", numbers)[:, None], shape)
         else:
@@ -206,18 +244,24 @@ class MeasurementSet(VisibilitySet):
     def _put(self, table: Any, name: str, block: Visibilities) -> None:
         """Write a block, where its times and channels are."""
         rows, frame = self.rows, self.frame
-        first = int(np.abs(rows.slots_s - block.at.slots_s[0]).argmin())
-        times = slice(first, first + len(block.at.slots_s))
+        times, channels = self._where(block)
         numbers = rows.of(times)
         one, two = (at_rows(table, station, numbers) for station in ("ANTENNA1", "ANTENNA2"))
         place = places(self.path, rows, len(frame.layout), times, one, two)
         data = np.moveaxis(block.data, 1, 2).reshape(-1, len(block.freq_hz), 2, 2)[place]
         turned = one > two
         data[turned] = np.conj(np.swapaxes(data[turned], -1, -2))
-        channels = np.searchsorted(frame.freq_hz, block.freq_hz - 1.0)
-        if len(channels) < len(frame.freq_hz):
+        if len(block.freq_hz) < len(frame.freq_hz):
             whole = frame.linear(self._cube(table, name, numbers))
             whole[:, channels] = data
             data = whole
         values = frame.correlated(data)
         put_rows(table, name, numbers, values[:, ::-1] if frame.backwards else values)
+
+
+def _kept(blocks: VisibilitySet | Iterable[Visibilities], folder: Path) -> VisibilityFile:
+    """Blocks in a file: where they cannot be worked out, it is known before anything is written."""
+    if isinstance(blocks, VisibilityFile):
+        return blocks
+    as_set(blocks).save(folder / "blocks.h5")
+    return VisibilityFile(folder / "blocks.h5")

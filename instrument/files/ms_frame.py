@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,10 @@ class Frame:
     pointing: Direction
     field: int
     described: int  # row of DATA_DESCRIPTION
+
+    def of(self, channels: slice) -> Frame:
+        """The same for some channels."""
+        return replace(self, freq_hz=self.freq_hz[channels], width_hz=self.width_hz[channels])
 
     def linear(self, data: Complex) -> Complex:
         """Correlations (..., n) in the order of the file as matrices (..., 2, 2) of receptors p, q.

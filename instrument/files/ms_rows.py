@@ -48,12 +48,13 @@ def rows_of(table: Any, frame: Frame, path: str) -> Rows:
     return found._replace(interval_s=interval, autos=autos)
 
 
-def at_rows(table: Any, name: str, numbers: Int) -> Any:
-    """Values of a column at some rows: those that follow each other in one go."""
+def at_rows(table: Any, name: str, numbers: Int, channels: slice | None = None) -> Any:
+    """Values of a column at some rows, of some channels: rows that follow each other in one go."""
+    where: Any = np.asarray(numbers)
     if len(numbers) and numbers[-1] - numbers[0] + 1 == len(numbers) and np.all(np.diff(numbers) == 1):
-        return column(table, name, slice(int(numbers[0]), int(numbers[-1]) + 1))
+        where = slice(int(numbers[0]), int(numbers[-1]) + 1)
     with told(f"column {name}"):
-        return np.array(table.getcol(name, (np.asarray(numbers),)))
+        return np.array(table.getcol(name, (where,) if channels is None else (where, channels)))
 
 
 def put_rows(table: Any, name: str, numbers: Int, values: Complex) -> None:

@@ -66,13 +66,13 @@ def _too_much(found: RunPlan, limit: float, memory: Any) -> str:
 def whole(file: SceneFile, scene: Scene, plan: Plan, verify: bool = True) -> RunPlan:
     """What every step of a run costs on a plan of its prediction."""
     run = Running(file.name, file.seed, scene.instrument, plan, file.running)
-    works = {} if file.alone else {PREDICT: predicting(plan)}
+    works = {PREDICT: predicting(plan)} if file.modelled and not file.alone else {}
     if any(stage.perfect for stage in file.running.values()):
         works[RECEIVERS] = copies(run.visibilities, run.block, 2.0, 0.55e-6, "their errors put into the blocks")
     items = {}
     for name, stage in file.running.items():
         works[name], items[name] = stage.work(run), stage.items(run)
-    if verify:
+    if verify and file.modelled:
         works[VERIFY] = _verifying(plan)
     figures = sum(work.figures for work in works.values())
     works[WRITE] = StageWork(

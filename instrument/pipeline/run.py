@@ -69,7 +69,7 @@ def _planned(scene_file: SceneFile, path: Path, memory: str | None, workers: int
     scene = scene_file.scene()
     whole = plan_run(scene_file, scene, memory, workers, verify)
     plan = whole.plan
-    if verify:  # the blocks as the stages get them, before any corruption
+    if verify and scene_file.modelled:  # the blocks as the stages get them, before any corruption
         plan = plan.watched(samples=64, seed=scene_file.seed)
     return Result(scene_file, scene.instrument, plan, path, whole, seconds={"plan": time.perf_counter() - begin})
 
@@ -94,6 +94,7 @@ def _compute(result: Result, progress: Progress) -> None:
     """Stream the blocks through the stages that the scene has."""
     stages = result.scene.running
     run = Running(result.scene.name, result.scene.seed, result.instrument, result.plan, stages, parts=result.parts)
+    run.modelled, run.read = result.scene.modelled, result.scene.read
     assert result.whole is not None
     stream(run, result.timed, progress, result.whole.share)
     result.stages = run.results
@@ -132,7 +133,12 @@ def stream(
     def passed(done: float) -> None:
         progress(passing * done, named)
 
-    blocks = run.plan.blocks(progress=passed) if alone is None else work[alone].blocks(passed)
+    if alone is not None:
+        blocks = work[alone].blocks(passed)
+    elif run.modelled or run.source is None:
+        blocks = run.plan.blocks(progress=passed)
+    else:
+        blocks = run.source.blocks()
     end = object()
     while True:
         with at_work(alone or PREDICT):

@@ -15,18 +15,23 @@ from instrument.jones.feed import FeedTerm
 from instrument.jones.gain import GainTerm
 from instrument.model import Instrument
 from instrument.numbers import Seed, Tolerance, brief
+from instrument.observe.observation import Observation
 from instrument.pipeline.observation_table import ObservationTable
 from instrument.pipeline.stage import SEED_STEP, Beside, Stage, in_order
+from instrument.pipeline.stages.data import Data
 from instrument.plan import Item, Plan
 from instrument.registry import available, load, names, plugin_class
 from instrument.scene import Scene
 from instrument.sky.base import Sky
+from instrument.sky.points import PointSky
 
 MOST_CHANNELS = 1_000_000
 
 
 class SceneFile(Component):
     """A scene file: `instrument`, `observation` and `sky`, and the `tables` of the stages that follow.
+
+    With a table [data] the observation is that of the data, and the sky may be left out where no stage needs a model.
 
     A table names a stage, by its plugin: `[noise]`, `[image]`. With `kind = K` in it the stage "TABLE.K" is taken where
     there is one. An absent table is a stage that is left out.
@@ -38,14 +43,16 @@ class SceneFile(Component):
     tolerance: Tolerance = 0.0
     engine: str | None = None
     instrument: dict[str, Any]
-    observation: ObservationTable
-    sky: dict[str, Any]
+    observation: ObservationTable | None = None
+    sky: dict[str, Any] = Field(default_factory=dict)
     tables: dict[str, dict[str, Any]] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _stages_fit(self) -> Self:
         # wrong settings of a stage are refused before anything is planned
         self.stages  # noqa: B018
+        if not self.sky and (lacking := [n for n, stage in self.stages.items() if stage.needs_sky]):
+            raise InputError(f"[{lacking[0]}] needs a model of the sky: give a table [sky]")
         odd = not self.name.isprintable() or self.name != self.name.strip() or len(self.name.encode()) > 200
         if not self.name or odd or any(c in self.name for c in "/\\") or self.name.startswith("."):
             raise InputError(f"name = {brief(self.name)} cannot name a folder")
@@ -54,8 +61,40 @@ class SceneFile(Component):
     @cached_property
     def stages(self) -> dict[str, Stage]:
         """Every stage that is there, by its table, in the order of the run."""
-        beside = Beside(self.seed, self.tables, self.observation.width_hz)
+        beside = Beside(self.seed, self.tables, self.observed.width_hz)
         return in_order({name: _stage(name, settings, beside) for name, settings in self.tables.items()})
+
+    @cached_property
+    def data(self) -> Data | None:
+        """The visibilities that take the place of those that would be simulated, where there is [data]."""
+        if "data" not in self.tables:
+            return None
+        found = _stage("data", self.tables["data"], Beside(self.seed, {}, None))
+        assert isinstance(found, Data)
+        return found
+
+    @cached_property
+    def observed(self) -> Observation:
+        """The observation of the table [observation], or that of the data."""
+        if (self.data is None) == (self.observation is None):
+            said = "[observation] stands beside [data], whose observation is taken: leave one of them out"
+            raise InputError("a scene needs a table [observation]" if self.data is None else said)
+        if self.data is not None:
+            with _in_table("data"):
+                return self.data.observation
+        assert self.observation is not None
+        with _in_table("observation"):
+            return self.observation.observation()
+
+    @property
+    def modelled(self) -> bool:
+        """Whether anything is predicted: not where visibilities are those of [data] and no stage needs a model."""
+        return self.data is None or any(stage.needs_sky for stage in self.running.values())
+
+    @property
+    def read(self) -> bool:
+        """Whether visibilities are read from [data]: not where a prediction alone is written into the set."""
+        return self.data is not None and any(stage.reads for stage in self.running.values())
 
     @property
     def alone(self) -> str | None:
@@ -70,6 +109,8 @@ class SceneFile(Component):
     def telescope(self) -> Instrument:
         """The instrument of the table [instrument]."""
         settings = dict(self.instrument)
+        if self.data is not None:
+            settings.setdefault("stations", self.data.source.frame.layout.names)
         name = settings.pop("telescope", None)
         if name is None:
             raise InputError(f"[instrument] needs 'telescope': one of {', '.join(available('telescopes'))}")
@@ -84,11 +125,16 @@ class SceneFile(Component):
         for label, term in zip(self.instrument.get("terms", ()), found.terms, strict=True):
             with _in_table(f"instrument.terms.{label}"):
                 found.with_fields(terms=(term,)).chain()  # a term that fits nowhere is told by its label
+        if self.read and (errors := [public_name(type(term)) for term in found.errors()]):
+            unused("[instrument]", errors, "[data] has the errors of its own instrument")
+            found = found.perfect()
         return found
 
     def sky_model(self) -> Sky:
         """The sky of the table [sky]."""
         settings = dict(self.sky)
+        if not self.modelled:
+            return _stand_in(self.observed)
         kind = settings.pop("kind", None)
         if kind is None:
             raise InputError(f"[sky] needs 'kind': one of {', '.join(available('skies'))}")
@@ -98,9 +144,7 @@ class SceneFile(Component):
 
     def scene(self) -> Scene:
         """The scene: instrument, sky and observation."""
-        with _in_table("observation"):
-            observation = self.observation.observation()
-        return Scene(name=self.name, instrument=self.telescope(), sky=self.sky_model(), observation=observation)
+        return Scene(name=self.name, instrument=self.telescope(), sky=self.sky_model(), observation=self.observed)
 
     def products_uv_range(self) -> tuple[float, float] | None:
         """The uv range, in wavelengths, that holds all the products asked for; `None` when one needs all baselines."""
@@ -140,6 +184,8 @@ class SceneFile(Component):
             left_out = [item for item in left_out if item.name not in ("GainTerm", "FeedTerm")]
         if self.running:
             kept.append(Item("stages", ", ".join(self.running) + (", in this order" if len(self.running) > 1 else "")))
+        if not self.modelled:
+            left_out = [Item("prediction", "visibilities are there, and no stage compares them with a sky")]
         if absent:
             left_out.append(Item("other stages", f"not in the scene: {', '.join(absent)}"))
         return found.changed(kept=tuple(kept), left_out=tuple(left_out))
@@ -152,6 +198,15 @@ class SceneFile(Component):
             given = [f"[{table}]" for table in self.tables if table not in taken]
             kind = self.tables[alone].get("kind", alone)
             unused("scene", given, f"a laboratory, [{alone}] kind = '{kind}', makes its own figures")
+
+
+def _stand_in(observation: Observation) -> Sky:
+    """A point of 1 Jy for a plan to be made, where no sky is given and nothing is predicted."""
+    from astropy import units as u
+    from astropy.coordinates import SkyCoord
+
+    centre = observation.phase_centre
+    return PointSky.at(SkyCoord(centre.ra_rad * u.rad, centre.dec_rad * u.rad), [1.0])
 
 
 def _terms(tables: Any, seed: int) -> tuple[JonesTerm, ...]:
@@ -209,7 +264,7 @@ def parse(tables: dict[str, Any]) -> SceneFile:
             raise InputError(f"a scene has no '{name}': {did_you_mean(name, [*own, *known])}")
         if (name in known or name in ("instrument", "observation", "sky")) and not isinstance(value, dict):
             raise InputError(f"'{name}' must be a table, [{name}]")
-    for name in ("instrument", "observation", "sky"):
+    for name in ("instrument", *(() if "data" in tables else ("observation", "sky"))):
         if name not in tables:
             raise InputError(f"a scene needs a table [{name}]")
     return SceneFile(

@@ -19,7 +19,7 @@ from instrument.pipeline.work import Items, StageWork
 from instrument.plan import Plan
 from instrument.report.page import Card, FigureEntry, Section
 from instrument.scene import Scene
-from instrument.visibilities import Visibilities
+from instrument.visibilities import Visibilities, VisibilitySet
 
 SEED_STEP = 1000  # seeds of what a scene draws are derived from its one seed
 S = TypeVar("S", bound="Stage")
@@ -65,6 +65,16 @@ class Stage(Component):
         """
         return (None,)
 
+    @property
+    def reads(self) -> bool:
+        """Whether it looks at the visibilities that pass."""
+        return True
+
+    @property
+    def needs_sky(self) -> bool:
+        """Whether it needs a model of the sky, also where visibilities come from [data]."""
+        return self.perfect or self.alone is not None
+
     def check(self, scene: Scene) -> None:
         """Raise `InputError` for a scene in which this stage cannot work; name what it will not use (`unused`)."""
         return None
@@ -95,6 +105,9 @@ class Running:
     model: Visibilities | None = None  # the present block as it was predicted
     parts: dict[str, dict[str, float]] = field(default_factory=dict)  # seconds, by stage, of what it names
     now: str = ""  # the stage at work
+    modelled: bool = True  # else nothing is predicted, and the blocks are those of `source`
+    read: bool = False  # whether the blocks of `source` take the place of those that were predicted
+    source: VisibilitySet | None = None  # what [data] holds
     _densities: dict[str, dict[float, Density] | None] = field(default_factory=dict)
 
     @property
@@ -122,7 +135,7 @@ class Running:
         key = imager.fingerprint()
         if key not in self._densities:
             with self.timed("weights"):
-                self._densities[key] = imager.density(self.plan)
+                self._densities[key] = imager.density(self.source if self.read and self.source else self.plan)
         return self._densities[key]
 
     def stage(self, name: str, kind: type[S]) -> S | None:

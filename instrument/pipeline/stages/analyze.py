@@ -34,7 +34,7 @@ STOKES: tuple[Literal["I", "P", "V"], ...] = ("I", "P", "V")
 class Analyze(Stage):
     """What is made of sources and images: products, settings of forced photometry, and the analysis of the cube."""
 
-    after: ClassVar[tuple[str, ...]] = ("noise", "calibrate", "correct", "image")
+    after: ClassVar[tuple[str, ...]] = ("data", "noise", "calibrate", "correct", "image")
     products: tuple[Literal["leakage", "spectrum-2d", "recovered"], ...] = ("leakage",)
     uv_range: UvRange | None = None
     every: Count = 1
@@ -56,6 +56,11 @@ class Analyze(Stage):
                 "others; take [image] kind = 'dirty' or 'beam'"
             )
         return found
+
+    @property
+    def needs_sky(self) -> bool:
+        """For what is compared with the sources that are there."""
+        return bool({"leakage", "recovered"} & set(self.products))
 
     def ranges(self) -> tuple[tuple[float, float] | None, ...]:
         """That of the photometry, where there is one."""

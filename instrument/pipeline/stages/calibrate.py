@@ -64,7 +64,7 @@ class Calibrate(Stage):
     `kind` is a calibrator; the other settings of the table are its own. Those of "selfcal" are:
     """
 
-    after: ClassVar[tuple[str, ...]] = ("noise",)
+    after: ClassVar[tuple[str, ...]] = ("data", "noise")
     perfect: ClassVar[bool] = True
     settings_of: ClassVar[tuple[type[Component], ...]] = (SelfCal,)
     calibrator: Calibrator

@@ -15,7 +15,7 @@ BLOCK = 8e-3  # seconds of a block, for where the phase centre stands and the be
 class Correct(Stage):
     """Takes effects out of the visibilities: `beam = "centre"` the beam towards the phase centre."""
 
-    after: ClassVar[tuple[str, ...]] = ("noise", "calibrate")
+    after: ClassVar[tuple[str, ...]] = ("data", "noise", "calibrate")
     beam: Literal["centre"] = "centre"
 
     def ranges(self) -> tuple[tuple[float, float] | None, ...]:

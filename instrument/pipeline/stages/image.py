@@ -40,7 +40,7 @@ GRIDDED = 250.0  # bytes of a visibility while it is gridded
 class Image(Stage):
     """Images by an `imager`, whose settings are those of the table."""
 
-    after: ClassVar[tuple[str, ...]] = ("noise", "calibrate", "correct")
+    after: ClassVar[tuple[str, ...]] = ("data", "noise", "calibrate", "correct")
     settings_of: ClassVar[tuple[type[Component], ...]] = (Imager,)
     imager: AnyImager
 

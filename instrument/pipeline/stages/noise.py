@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
@@ -22,6 +22,7 @@ class Noise(Stage):
     With `nights` it is that of the mean of so many nights like this one: its variance over their number.
     """
 
+    after: ClassVar[tuple[str, ...]] = ("data",)
     sefd: Annotated[Jansky, Field(gt=0)]
     nights: Annotated[float, Real(above=0)] = 1.0
     seed: Seed

@@ -1,0 +1,36 @@
+"""The verbs `predict`, `calibrate`, `image` and `subtract`: scenes made to work on the visibilities of a set."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from instrument.errors import InputError
+
+OWN = ("name", "title", "seed", "tolerance", "engine", "instrument", "sky")
+STAGES = {"predict": (), "calibrate": ("calibrate",), "image": ("correct", "image", "analyze"), "subtract": ()}
+WRITES = {
+    "predict": ("model", "MODEL_DATA"),
+    "calibrate": ("data", "CORRECTED_DATA"),
+    "subtract": ("difference", "SUBTRACTED_DATA"),
+}
+HELP = {
+    "predict": "Predict the sky of a scene into a column of a Measurement Set, with its times, channels and UVW.",
+    "calibrate": "Calibrate the data of a Measurement Set against the sky of a scene, and write them corrected.",
+    "image": "Image and analyze the data of a Measurement Set as a scene says.",
+    "subtract": "Take the sky of a scene off the data of a Measurement Set.",
+}
+
+
+def tables_on(verb: str, tables: dict[str, Any], data: dict[str, Any], into: str | None, force: bool) -> dict[str, Any]:
+    """The tables of a scene as a verb has them: on the visibilities `data`, whose column `into` is written.
+
+    Raises `InputError` where the scene lacks the table that the verb is about.
+    """
+    if verb in STAGES[verb] and verb not in tables:
+        raise InputError(f"{verb} takes its settings from a table [{verb}], which the scene has not")
+    kept = {name: value for name, value in tables.items() if name in (*OWN, *STAGES[verb])}
+    out = kept | {"data": {name: value for name, value in data.items() if value is not None}}
+    if verb not in WRITES:
+        return out
+    what, usual = WRITES[verb]
+    return out | {"into": {"what": what, "column": into or usual, "overwrite": force}}
