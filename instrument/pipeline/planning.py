@@ -67,7 +67,7 @@ def whole(file: SceneFile, scene: Scene, plan: Plan, verify: bool = True) -> Run
     """What every step of a run costs on a plan of its prediction."""
     run = Running(file.name, file.seed, scene.instrument, plan, file.running)
     works = {PREDICT: predicting(plan)} if file.modelled and not file.alone else {}
-    if any(stage.perfect for stage in file.running.values()):
+    if not file.read and any(stage.perfect for stage in file.running.values()):
         works[RECEIVERS] = copies(run.visibilities, run.block, 2.0, 0.55e-6, "their errors put into the blocks")
     items = {}
     for name, stage in file.running.items():

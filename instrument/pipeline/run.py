@@ -121,7 +121,7 @@ def stream(
         return timed(name)
 
     work: dict[str, StageRun] = {}
-    if any(stage.perfect for stage in run.stages.values()):
+    if not run.read and any(stage.perfect for stage in run.stages.values()):
         errors = Chain(*run.instrument.receivers())
         work[RECEIVERS] = EachBlock(lambda block: block.corrupted(errors))
     for name, stage in run.stages.items():

@@ -63,6 +63,7 @@ LAYERS = (
     ("doctor_checks",),
     ("doctor",),
     ("",),  # `instrument` itself, which looks names up in all of them when they are first used
+    ("cli_analyze",),
     ("cli",),
 )
 # (importer, imported): why this one import inside a function may run back

@@ -55,6 +55,8 @@ class Data(Stage):
     def check(self, scene: Scene) -> None:
         """Refuse stations that are elsewhere."""
         told, layout = self.source.frame.layout, scene.instrument.layout()
+        if lacking := [name for name in layout.names if name not in told.names]:
+            raise InputError(f"{self.set} has no station {lacking[0]}: it has {', '.join(told.names[:5])}, ...")
         apart = np.linalg.norm(
             layout.positions_m - told.positions_m[[told.names.index(n) for n in layout.names]], axis=1
         )

@@ -22,7 +22,7 @@ from instrument.scene import Scene
 from instrument.store import StoreWriter
 from instrument.terminal import finished
 from instrument.visibilities import Visibilities
-from instrument.visibility_sets import VisibilityFile
+from instrument.visibility_sets import BLOCK_BYTES, VisibilityFile
 
 KEEPING, WRITING = 1.0e-6, 1.0e-6  # seconds of a visibility: into the file beside the set, and from there into it
 WHAT = {"data": "the visibilities", "model": "the prediction", "difference": "visibilities less the prediction"}
@@ -81,7 +81,7 @@ class Into(Stage):
             seconds=KEEPING * run.visibilities,
             finish_seconds=WRITING * run.visibilities,
             block_bytes=2 * 64.0 * float(np.prod(run.block)),
-            finish_bytes=300e6,  # of blocks of 64 MB, as they are here and as the file has them
+            finish_bytes=min(4 * BLOCK_BYTES, 4 * 64.0 * run.visibilities),  # as they are here and in the set
         )
 
     def items(self, run: Running) -> Items:
@@ -130,6 +130,7 @@ class _IntoRun(StageRun):
         self.beside = tempfile.TemporaryDirectory(dir=place.parent, prefix=f".{place.name}.")
         self.kept = Path(self.beside.name) / "blocks.h5"
         self.writer: StoreWriter | None = None
+        self.flagged = 0.0
 
     def take(self, block: Visibilities) -> Visibilities:
         """Keep it, or what was predicted, or the one less the other."""
@@ -141,6 +142,8 @@ class _IntoRun(StageRun):
             made = self.run.source.back(made)
         self.writer = self.writer or StoreWriter(self.kept, made)
         self.writer.add(made)
+        flag = self.stage.what == "data" and block.flag
+        self.flagged += float(np.mean(flag)) * len(block.at.slots_s) * len(block.freq_hz)
         return block
 
     def finish(self) -> StageResult:
@@ -155,14 +158,15 @@ class _IntoRun(StageRun):
             self.run.source.source.write(stage.column, kept, stage.overwrite)
         self.beside.cleanup()
         finished.append(f"column {stage.column} of {stage.set} is written")
-        return IntoResult(stage)
+        times, channels, _ = kept.store.shape
+        return IntoResult(stage, 0.0 if stage.fresh else self.flagged / (times * channels))
 
 
 class IntoResult(StageResult):
     """Where it was written."""
 
-    def __init__(self, stage: Component) -> None:
-        self.stage = stage
+    def __init__(self, stage: Component, flagged: float) -> None:
+        self.stage, self.flagged = stage, flagged
 
     def record(self) -> dict[str, Any]:
         """The set and column."""
@@ -171,4 +175,5 @@ class IntoResult(StageResult):
     def lines(self) -> list[str]:
         """The same in words."""
         stage: Any = self.stage
-        return [f"into          {WHAT[stage.what]}: column {stage.column} of {stage.set}"]
+        said = f"; {100 * self.flagged:.3g} % flagged here: FLAG is as it was" if self.flagged else ""
+        return [f"into          {WHAT[stage.what]}: column {stage.column} of {stage.set}{said}"]
