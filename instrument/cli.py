@@ -67,18 +67,7 @@ def parser() -> argparse.ArgumentParser:
     both.add_argument("first", metavar="RUN", help="a run folder")
     both.add_argument("second", metavar="RUN", help="another, held against the first")
     _add_out(both, "folder to write a page compare.html into, new or empty (default: none is written)")
-    text = "Error against run time of a scene, a stage, a kind of plugin, or a plugin beside the others of its kind."
-    verb = verbs.add_parser("precision", help=text, description=text)
-    verb.add_argument("what", metavar="WHAT", help="a scene, a stage, a kind of plugin (engines, ...), or a plugin")
-    verb.add_argument("--plugins", metavar="A,B", help="of these plugins alone (default: all that can be had)")
-    verb.add_argument("--quick", action="store_true", help="one value a decade, three repeats")
-    verb.add_argument("--peers", action="store_true", help="draw in other programs, those that are installed")
-    _add_out(verb, "folder to write, new or empty (default: runs/precision-WHAT, or the next free name)")
-    text = "Try named extreme cases with right answers: right, refused or WRONG, in digits."
-    cases = verbs.add_parser("stress", help=text, description=text)
-    cases.add_argument("what", metavar="WHAT", nargs="?", help="a scene, a kind of plugins, a plugin (default: all)")
-    cases.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings", help="of the plugin")
-    _add_out(cases, "folder to write stress.ecsv into, new or empty (default: none is written)")
+    _add_contests(verbs)
     _add_paper(verbs)
     verbs.add_parser("scenes", help="List the shipped scenes.")
     plugins = verbs.add_parser("plugins", help="List the plugins, and what is broken; with a NAME its settings.")
@@ -99,6 +88,21 @@ def _add_out(verb: argparse.ArgumentParser, text: str = "") -> None:
     usual = "folder to write, new or empty (default: runs/NAME, or NAME-2, NAME-3, ... where that is taken)"
     verb.add_argument("--out", metavar="DIR", help=f"{text or usual}; nothing that is there is overwritten")
     verb.add_argument("--force", action="store_true", help="replace an earlier run in that folder")
+
+
+def _add_contests(verbs: Any) -> None:
+    text = "Error against run time of a scene, a stage, a kind of plugin, or a plugin beside the others of its kind."
+    verb = verbs.add_parser("precision", help=text, description=text)
+    verb.add_argument("what", metavar="WHAT", help="a scene, a stage, a kind of plugin (engines, ...), or a plugin")
+    verb.add_argument("--plugins", metavar="A,B", help="of these plugins alone (default: all that can be had)")
+    verb.add_argument("--quick", action="store_true", help="one value a decade, three repeats")
+    verb.add_argument("--peers", action="store_true", help="draw in other programs, those that are installed")
+    _add_out(verb, "folder to write, new or empty (default: runs/precision-WHAT, or the next free name)")
+    text = "Try named extreme cases with right answers: right, refused or WRONG, in digits."
+    cases = verbs.add_parser("stress", help=text, description=text)
+    cases.add_argument("what", metavar="WHAT", nargs="?", help="a scene, a kind of plugins, a plugin (default: all)")
+    cases.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings", help="of the plugin")
+    _add_out(cases, "folder to write stress.ecsv into, new or empty (default: none is written)")
 
 
 def _add_data(verb: argparse.ArgumentParser, name: str) -> None:
