@@ -34,7 +34,7 @@ def parser() -> argparse.ArgumentParser:
     verbs = top.add_subparsers(dest="verb", metavar="VERB", required=True, parser_class=_Parser)
 
     def scene_verb(name: str, text: str) -> argparse.ArgumentParser:
-        verb = verbs.add_parser(name, help=text, description=text)
+        verb: argparse.ArgumentParser = verbs.add_parser(name, help=text, description=text)
         verb.add_argument("scene", metavar="SCENE", help="a .toml file, or the name of a shipped scene")
         verb.add_argument(
             "--set",
