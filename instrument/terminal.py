@@ -6,6 +6,7 @@ import contextlib
 import os
 import signal
 import sys
+import time
 import traceback
 import unicodedata
 import warnings
@@ -16,6 +17,8 @@ from typing import Any
 from instrument.errors import InputError, InstrumentError, InstrumentWarning
 
 DONE, FAILED, BAD_INPUT, FELL_SHORT = 0, 1, 2, 3
+CLEANING_S = 5.0  # in which a second signal is not taken for a second wish
+_stopped_at = float("-inf")  # when a signal came
 LEAST_ADDRESSES = 1.5e9  # bytes of `ulimit -v` below which LLVM and BLAS abort while they are loaded
 finished: list[str] = []  # what this process has done that stays, also where it is stopped after it
 _lost: list[OSError] = []  # why standard output takes nothing more
@@ -82,16 +85,19 @@ def status_of(work: Callable[[], int]) -> int:
 
 def process(work: Callable[[], int]) -> int:
     """The same for a whole process: signals stop it cleanly, and closed or full streams do not."""
+    global _stopped_at
     _open_streams()
     _forget_the_working_directory()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is not signal.SIG_IGN:  # nohup
             signal.signal(number, _stop)
     finished.clear()
+    _stopped_at = float("-inf")
     try:
         status = status_of(lambda: _within_limits(work))
         _from_now_on_nothing_stops_it()
-    except KeyboardInterrupt:  # as the work had ended: it is raised once, so what follows is not stopped
+    except KeyboardInterrupt:  # as the work had ended
+        _from_now_on_nothing_stops_it()
         _say_stopped()
         status = FAILED
     try:
@@ -124,9 +130,14 @@ def _within_limits(work: Callable[[], int]) -> int:
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
-    """Ends the work once; what comes while it is being cleaned up changes nothing."""
-    _from_now_on_nothing_stops_it()
-    raise KeyboardInterrupt
+    """Ends the work; what comes while it is being cleaned up changes nothing.
+
+    One that comes later ends it again: an interrupt that is raised where Python cannot pass it on (`__del__`) is lost.
+    """
+    global _stopped_at
+    if time.monotonic() - _stopped_at > CLEANING_S:
+        _stopped_at = time.monotonic()
+        raise KeyboardInterrupt
 
 
 def _from_now_on_nothing_stops_it() -> None:

@@ -195,3 +195,33 @@ def test_g6_a_run_stopped_once_its_folder_is_there_says_that_it_is_written(tmp_p
     done = subprocess.run([sys.executable, "-c", STOPPED, when], cwd=tmp_path, capture_output=True, text=True)
     assert done.stderr == f"instrument: {line}\n" and done.returncode == 1
     assert (tmp_path / "o").exists() == (when != "within")
+
+
+LOST = """
+import os, signal, sys, time
+from instrument import terminal
+
+terminal.CLEANING_S = 0.2
+
+class Odd:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGINT)
+        for _ in range(100):
+            pass
+
+def work():
+    odd = Odd()
+    del odd  # the interrupt is raised where nothing can catch it
+    time.sleep(0.3)
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(5)
+    return 0
+
+sys.exit(terminal.process(work))
+"""
+
+
+def test_an_interrupt_that_was_lost_does_not_make_a_run_that_nothing_stops(tmp_path):
+    done = subprocess.run([sys.executable, "-c", LOST], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1 and "Exception ignored" in done.stderr
+    assert done.stderr.endswith("instrument: stopped; nothing was written\n")

@@ -54,8 +54,8 @@ def test_wsclean_sees_the_images_that_we_see(seen, ours, tmp_path):
         pytest.skip("WSClean is not installed")
     command = [
         "wsclean", "-j", "1", "-quiet", "-no-update-model-required", "-use-wgridder", "-wgridder-accuracy", "1e-5",
-        "-pol", "iquv", "-weight", "natural", "-size", str(PIXELS), str(PIXELS), "-scale", "1amin", "-no-small-inversion",
-        "-name", str(tmp_path / "x"), str(seen[0]),
+        "-pol", "iquv", "-weight", "natural", "-size", str(PIXELS), str(PIXELS), "-scale", "1amin",
+        "-no-small-inversion", "-name", str(tmp_path / "x"), str(seen[0]),
     ]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"OPENBLAS_NUM_THREADS": "1"})
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
