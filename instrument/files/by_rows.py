@@ -112,7 +112,10 @@ def _compare(path: str, own: Float, ours: Float) -> None:
     size = float(np.sqrt((ours**2).sum())) or 1.0
     apart, turned = (float(np.sqrt(((own - sign * ours) ** 2).sum())) / size for sign in (1, -1))
     if turned < FAR:
-        warn(f"{path}: UVW are of the other sign, antenna 1 minus 2: what is imaged or predicted is mirrored")
+        warn(
+            f"{path}: UVW are antenna 1 minus 2, the definition has 2 minus 1: fringes are those of the UVW as they "
+            "stand; array factors of stations then have the other sign (phase = 'everybeam')"
+        )
     elif apart > FAR:
         warn(
             f"{path}: UVW are {100 * apart:.2g} % off those of its stations, times and phase centre: another "

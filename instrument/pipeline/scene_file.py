@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from contextlib import suppress
 from functools import cached_property
 from typing import Any, Self
 
@@ -109,11 +110,11 @@ class SceneFile(Component):
     def telescope(self) -> Instrument:
         """The instrument of the table [instrument]."""
         settings = dict(self.instrument)
-        if self.data is not None:
-            settings.setdefault("stations", self.data.source.frame.layout.names)
         name = settings.pop("telescope", None)
         if name is None:
             raise InputError(f"[instrument] needs 'telescope': one of {', '.join(available('telescopes'))}")
+        if self.data is not None:
+            settings = self._of_data(name) | settings
         for step, (key, cls) in enumerate((("gain", GainTerm), ("feed", FeedTerm)), start=1):
             if isinstance(settings.get(key), dict):
                 with _in_table(f"instrument.{key}"):
@@ -129,6 +130,17 @@ class SceneFile(Component):
             unused("[instrument]", errors, "[data] has the errors of its own instrument")
             found = found.perfect()
         return found
+
+    def _of_data(self, telescope: str) -> dict[str, Any]:
+        """What a telescope is told of the stations of the data, where it takes it."""
+        assert self.data is not None
+        layout = self.data.source.frame.layout
+        names = tuple(self.instrument.get("stations", layout.names))
+        told: dict[str, Any] = {"stations": names}
+        with suppress(ValueError):  # a station that is not there is told by the stage
+            told["positions_m"] = layout.positions_m[[layout.names.index(name) for name in names]]
+        fields = plugin_class("telescopes", telescope, needed=True).model_fields
+        return {name: value for name, value in told.items() if name in fields}
 
     def sky_model(self) -> Sky:
         """The sky of the table [sky]."""

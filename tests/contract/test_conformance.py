@@ -51,6 +51,7 @@ SETTINGS: dict[tuple[str, ...], list[dict[str, Any]]] = {
         {"beam": "element", "gain": GainTerm(rms=0.1), "feed": FeedTerm(rms=0.1)},
         {"beam": None, "gain": GainTerm(rms=0.1)},
     ],
+    ("telescopes", "array"): [{}, {"element": {"kind": "dipole"}}],
     ("telescopes", "lofar-lba"): [{}, {"antennas": "inner", "phase": "everybeam"}],
     ("foregrounds", "gmca"): [{}, {"paper": True, "stokes": "Q"}],
     ("foregrounds", "gmca", "long"): [{"mode": "threshold"}, {"noise": "white"}],
