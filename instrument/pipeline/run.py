@@ -128,7 +128,8 @@ def stream(
         with at_work(name):
             work[name] = stage.start(run)
     alone = next((name for name, stage in run.stages.items() if stage.alone is not None), None)
-    named = alone or ", ".join([PREDICT, *work])
+    source = alone or (PREDICT if run.modelled else "data")
+    named = ", ".join(dict.fromkeys([source, *work])) if alone is None else alone
 
     def passed(done: float) -> None:
         progress(passing * done, named)
@@ -141,7 +142,7 @@ def stream(
         blocks = run.source.blocks()
     end = object()
     while True:
-        with at_work(alone or PREDICT):
+        with at_work(source):
             block = next(blocks, end)
         if not isinstance(block, Visibilities):
             break

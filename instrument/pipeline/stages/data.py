@@ -19,7 +19,8 @@ from instrument.scene import Scene
 from instrument.units import Bool, Int
 from instrument.visibilities import Visibilities, VisibilitySet
 
-READING = 0.5e-6  # seconds of a visibility
+READING = 1.0e-6  # seconds of a visibility
+COPIES = 9  # of a block: as the file has it, as matrices, in the order of the plan; with weights and flags
 
 
 class Data(Stage):
@@ -69,7 +70,7 @@ class Data(Stage):
         return StageWork(
             f"from {self.column} of {self.set}",
             seconds=READING * run.visibilities,
-            block_bytes=4 * 64.0 * float(np.prod(run.block)),
+            block_bytes=COPIES * 64.0 * float(np.prod(run.block)),
         )
 
     def start(self, run: Running) -> StageRun:
