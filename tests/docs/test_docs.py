@@ -1,12 +1,13 @@
 """The documentation does what it says: its code runs, its links resolve, its pictures show what is there.
 
 Every Python block of a page runs, in order, in one module per page. What a line `# -> text` promises must be printed by
-its block. TOML blocks are checked as scene files, or as entry points.
+its block. TOML blocks are checked as scene files, or as entry points. A block below `<!-- needs MODULE -->` runs where that is installed.
 """
 
 import ast
 import contextlib
 import importlib.metadata
+import importlib.util
 import io
 import re
 import subprocess
@@ -55,7 +56,11 @@ def test_python_blocks_run_and_print_what_the_page_says(page, tmp_path, monkeypa
     monkeypatch.chdir(tmp_path)
     module = types.ModuleType(f"page_{page.stem}")
     monkeypatch.setitem(sys.modules, module.__name__, module)  # classes made on the page are found by their JSON
+    lines = page.read_text(encoding="utf-8").splitlines()
     for line, text in blocks(page, "python"):
+        needed = re.fullmatch(r"<!-- needs (\w+) -->", lines[line - 3])
+        if needed and importlib.util.find_spec(needed[1]) is None:
+            continue
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):
             # as many empty lines before as on the page: a traceback then names the right one
