@@ -203,7 +203,9 @@ def tables(runs):
         for f in every:
             std = known.get((name, f.what), (0.0, 0))[0]
             lines.append(
-                row(f).replace(f"| {f.value} |", f"| {f.value} ± {number(std, 2)} |", 1) if std > 1e-9 * abs(f.ours) else row(f)
+                row(f).replace(f"| {f.value} |", f"| {f.value} ± {number(std, 2)} |", 1)
+                if std > 1e-9 * abs(f.ours)
+                else row(f)
             )
         parts.append("".join(lines).rstrip())
         parts += [f"![{name}: {figure}](reports/paper/{name}_{figure}.png)" for figure in SHOWN[name]]
