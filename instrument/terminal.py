@@ -53,6 +53,7 @@ def printable(text: str) -> str:
 def status_of(work: Callable[[], int]) -> int:
     """The exit status of what `work` does; every error is one line."""
     warnings.showwarning = _show_warning  # type: ignore[assignment]
+    finished.clear()
     try:
         return work()
     except InputError as error:
@@ -91,7 +92,6 @@ def process(work: Callable[[], int]) -> int:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is not signal.SIG_IGN:  # nohup
             signal.signal(number, _stop)
-    finished.clear()
     _stopped_at = float("-inf")
     try:
         status = status_of(lambda: _within_limits(work))

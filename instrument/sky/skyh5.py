@@ -158,7 +158,7 @@ def _places(path: Path, parts: dict[str, Any], header: Any, polarized: bool) -> 
     return np.asarray(icrs.ra.rad), np.asarray(icrs.dec.rad)
 
 
-def write_skyh5(path: Path, sky: Sources) -> None:
+def to_skyh5(path: Path, sky: Sources) -> None:
     """Write a new SkyH5 file of a sky that `writers.write_sky` lets pass; positions in rad, to the last bit."""
     count = len(sky)
     index = None if sky.spectral_terms is None else sky.spectral_terms[:, 0]

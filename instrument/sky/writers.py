@@ -15,7 +15,7 @@ from instrument.errors import FileError, InputError
 from instrument.files_in import harmless
 from instrument.provenance import written_by
 from instrument.sky.bbs import write_bbs
-from instrument.sky.skyh5 import write_skyh5
+from instrument.sky.skyh5 import to_skyh5
 from instrument.sky.sources import OPTIONAL, Sources
 from instrument.whole_file import whole_file
 
@@ -187,6 +187,6 @@ def _write_oskar(path: Path, sky: Sources) -> None:
 FORMS = {
     ".csv": Form("CSV", _write_csv, terms=2, follows=False),
     ".ecsv": Form("ECSV", _write_ecsv, terms=2, follows=False),
-    ".skyh5": Form("SkyH5", write_skyh5, terms=1, follows=True, rotates=False, shaped=False),
+    ".skyh5": Form("SkyH5", to_skyh5, terms=1, follows=True, rotates=False, shaped=False),
     ".osm": Form("an OSKAR sky model", _write_oskar, terms=1, follows=True, named=False),
 }

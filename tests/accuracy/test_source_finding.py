@@ -153,8 +153,8 @@ def test_a_catalogue_is_written_as_ecsv_fits_and_bbs_text(tmp_path):
     back = PointSky.read(tmp_path / "a.skymodel", centre=CENTRE.skycoord)
     assert np.allclose(back.stokes_jy, found.stokes_jy[0], rtol=1e-12, atol=0)
     assert np.allclose(back.major_rad, found.major_rad, rtol=1e-9) and back.names == found.names
-    with pytest.raises(InputError, match=r"ends in \.ecsv"):
-        found.write(tmp_path / "a.csv")
+    with pytest.raises(InputError, match=r"ends in "):
+        found.write(tmp_path / "a.xyz")
 
 
 def test_an_island_that_takes_too_long_is_said():

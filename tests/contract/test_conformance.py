@@ -38,6 +38,8 @@ from instrument.predict.base import Blockwise, Work
 from instrument.predict.direct import Direct, DirectImages
 from instrument.registry import KINDS, available, load
 
+PLACES = [[3826577.1, 461022.9, 5064892.8], [3826653.1, 461098.9, 5064828.8], [3826703.1, 460922.9, 5064803.8]]
+OF_FILES = (("stages", "data"), ("stages", "into"))
 SETTINGS: dict[tuple[str, ...], list[dict[str, Any]]] = {
     ("elements", "airy"): [{"diameter": 25 * u.m}],
     ("elements", "dipole"): [{"height": 0.5 * u.m, "x_azimuth": 30 * u.deg}],
@@ -51,7 +53,10 @@ SETTINGS: dict[tuple[str, ...], list[dict[str, Any]]] = {
         {"beam": "element", "gain": GainTerm(rms=0.1), "feed": FeedTerm(rms=0.1)},
         {"beam": None, "gain": GainTerm(rms=0.1)},
     ],
-    ("telescopes", "array"): [{}, {"element": {"kind": "dipole"}}],
+    ("telescopes", "array"): [
+        {"stations": ("A", "B", "C"), "positions_m": PLACES},
+        {"stations": ("A", "B", "C"), "positions_m": PLACES, "element": {"kind": "dipole", "height": "1.5 m"}},
+    ],
     ("telescopes", "lofar-lba"): [{}, {"antennas": "inner", "phase": "everybeam"}],
     ("foregrounds", "gmca"): [{}, {"paper": True, "stokes": "Q"}],
     ("foregrounds", "gmca", "long"): [{"mode": "threshold"}, {"noise": "white"}],
@@ -104,15 +109,15 @@ REGISTERED = [
     for kind in KINDS
     for name in available(kind)
     for settings in SETTINGS.get((kind, name), [{}])
-    # scikit-learn is needed, below; files, in tests/accuracy/test_skies_of_files.py
-    if (kind, name) not in (("foregrounds", "ica"), ("skies", "image"), ("skies", "healpix"))
+    # scikit-learn is needed, below; files, in tests/accuracy/test_skies_of_files.py and tests/unit/test_on_data.py
+    if (kind, name) not in (("foregrounds", "ica"), *[("skies", name) for name in ("image", "healpix")], *OF_FILES)
 ]
 
 
 @pytest.mark.parametrize(("kind", "name", "settings"), REGISTERED, ids=lambda x: x if isinstance(x, str) else "")
 def test_every_registered_plugin_keeps_its_contract(kind, name, settings):
     found = load(kind, name, **settings)
-    if kind == "telescopes" and "stations" in type(found).model_fields:
+    if kind == "telescopes" and "stations" in type(found).model_fields and name != "array":
         names = found.layout().names
         found = load(kind, name, **settings, stations=[*names[:3], names[-1]])
     report = check(found)

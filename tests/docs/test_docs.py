@@ -1,7 +1,8 @@
 """The documentation does what it says: its code runs, its links resolve, its pictures show what is there.
 
 Every Python block of a page runs, in order, in one module per page. What a line `# -> text` promises must be printed by
-its block. TOML blocks are checked as scene files, or as entry points. A block below `<!-- needs MODULE -->` runs where that is installed.
+its block. TOML blocks are checked as scene files, or as entry points. A block below `<!-- needs MODULE -->` runs where
+that is installed.
 """
 
 import ast

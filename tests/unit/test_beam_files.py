@@ -55,6 +55,7 @@ def seen_by_pyuvdata(path, place, directions):
 
 
 def test_three_directions_come_back_as_the_beam_has_them(tmp_path, element):
+    pytest.importorskip("pyuvdata", reason="the extra 'uv'")
     write_uvbeam(tmp_path / "e.beamfits", element, TIME, FREQ, step=0.5 * u.deg)
     layout = element.layout()
     directions = SkyCoord([120, 150, 60] * u.deg, [48, 20, 70] * u.deg)
@@ -72,6 +73,7 @@ def test_three_directions_come_back_as_the_beam_has_them(tmp_path, element):
 
 def test_nodes_of_a_station_are_those_of_its_beam(tmp_path, lofar):
     """At a node nothing is interpolated: the peak of the array factor too, which is narrower than the grid."""
+    pytest.importorskip("pyuvdata", reason="the extra 'uv'")
     from pyuvdata import UVBeam
 
     pointing = SkyCoord("08h13m36.0s +48d13m03s")
@@ -106,6 +108,7 @@ def test_nodes_of_a_station_are_those_of_its_beam(tmp_path, lofar):
     ],
 )
 def test_an_impossible_beam_file_is_refused(tmp_path, element, changed, message):
+    pytest.importorskip("pyuvdata", reason="the extra 'uv'")
     given = {"path": "b.beamfits", "telescope": element, "time": TIME, "frequencies": FREQ} | changed
     with pytest.raises(InputError, match=message):
         write_uvbeam(**(given | {"path": tmp_path / given["path"]}))

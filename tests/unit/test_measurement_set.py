@@ -262,7 +262,10 @@ def test_a_scene_is_predicted_with_the_times_and_uvw_of_the_set(tmp_path, layout
 def test_uvw_of_another_sign_or_centre_are_said_and_those_that_are_not_numbers_refused(tmp_path, layout, whole):
     rows, data = rows_of(whole)
     time, one, two, uvw, window, field = rows
-    for name, other, said in (("sign", -uvw, "of the other sign"), ("centre", uvw[:, [1, 2, 0]], "% off those of its")):
+    for name, other, said in (
+        ("sign", -uvw, "UVW are antenna 1 minus 2"),
+        ("centre", uvw[:, [1, 2, 0]], "% off those of its"),
+    ):
         small_set.write(tmp_path / name, layout, (time, one, two, other, window, field), FREQ, data)
         with pytest.warns(InstrumentWarning, match=said):
             read(tmp_path / name)
