@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -15,7 +17,8 @@ from instrument.observe.directions import earth_frame
 from instrument.observe.recorded import Recorded
 from instrument.observe.sampling import Sampling, times_of
 from instrument.units import Bool, Complex, Float, Int
-from instrument.visibilities import Visibilities
+from instrument.visibilities import Visibilities, VisibilitySet
+from instrument.visibility_sets import BLOCK_BYTES
 
 SAME_S = 1e-3  # times as near as this are one
 FAR = 0.01  # 0.6 deg: precession from J2000 to 2050 is 0.7
@@ -52,6 +55,61 @@ class Where(NamedTuple):
     given_uvw_m: Float | None
     place: Int
     turned: Bool
+
+
+class RowFile(VisibilitySet):
+    """A file of rows as blocks of at most 64 MB of data: a reader sets fields and has `_coordinates`, `_block`."""
+
+    path: str
+    frame: Frame
+    rows: Rows
+    beam_state: BeamState
+
+    def __repr__(self) -> str:
+        times, channels, baselines = self.shape
+        return (
+            f"{type(self).__name__}({self.path}{self._which}: {self.frame.telescope}, {times} times, "
+            f"{channels} channels, {baselines} baselines, {len(self.frame.layout)} stations, {self.beam_state})"
+        )
+
+    _which = ""  # of what there is in the file, for the text
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Times, channels, baselines."""
+        return len(self.rows.slots_s), len(self.frame.freq_hz), len(self.rows.antenna1)
+
+    @property
+    def freq_hz(self) -> Float:
+        """Channel centres, Hz (F,), ascending."""
+        return self.frame.freq_hz
+
+    def observation(self) -> Recorded:
+        """The observation that the file holds, for a `Scene` that is predicted with its times, channels and UVW.
+
+        Raises `InputError` where the UVW are not those of stations, or integrations are not equally long.
+        """
+        return recorded(self.path, self.frame, self.rows, [self._coordinates(times) for times in self._steps()])
+
+    def blocks(self) -> Iterator[Visibilities]:
+        """Blocks in order of time, all channels each."""
+        for times in self._steps():
+            yield self._block(times)
+
+    def _steps(self) -> list[slice]:
+        return self.rows.steps(BLOCK_BYTES, len(self.freq_hz))
+
+    def _say_autos(self) -> None:
+        if self.rows.autos:
+            warn(f"{self.path}: {self.rows.autos} rows are autocorrelations: left out")
+
+    @abstractmethod
+    def _coordinates(self, times: slice) -> Where:
+        """Coordinates of some times."""
+
+    @abstractmethod
+    def _block(self, times: slice) -> Visibilities:
+        """The block of some times."""
 
 
 def in_time(numbers: Int, time: Float, one: Int, two: Int, stations: int, path: str) -> Rows:

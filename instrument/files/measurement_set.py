@@ -4,26 +4,25 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
 from instrument.checked import checked
-from instrument.errors import FileError, InputError, warn
+from instrument.errors import FileError, InputError
 from instrument.files import ms_create
-from instrument.files.by_rows import SAME_S, Where, block_of, coordinates, places, recorded
+from instrument.files.by_rows import SAME_S, RowFile, Where, block_of, coordinates, places
 from instrument.files.ms_frame import beam_state_of, beam_words, frame_of
 from instrument.files.ms_rows import add_column, at_rows, filled, in_parts, put_rows, rows_of
 from instrument.files.ms_tables import demand, opened, told
 from instrument.model import Instrument
-from instrument.observe.recorded import Recorded
 from instrument.observe.sampling import Sampling
 from instrument.store import Store
 from instrument.units import Float, Int
 from instrument.visibilities import Visibilities, VisibilitySet
-from instrument.visibility_sets import BLOCK_BYTES, VisibilityFile, as_set
+from instrument.visibility_sets import VisibilityFile, as_set
 from instrument.whole_file import free_folder, whole_folder
 
 SAME_RAD = 1e-9  # phase centres as near as this are one
@@ -33,7 +32,7 @@ MARK = "table.dat"  # a file of every set
 
 
 @checked
-class MeasurementSet(VisibilitySet):
+class MeasurementSet(RowFile):
     """One window and field of a Measurement Set: its column `column` in blocks of at most 64 MB of data.
 
     Rows may stand in any order, times may be irregular and baselines missing (they are flagged); autocorrelations are
@@ -58,51 +57,20 @@ class MeasurementSet(VisibilitySet):
             self.rows = rows_of(table, self.frame, self.path)
             self.weights = next((n for n in ("WEIGHT_SPECTRUM", "WEIGHT") if filled(table, n, self.rows)), "")
             self.beam_state = beam_state_of(table.getcolkeywords(column), self.path)
-        if self.rows.autos:
-            warn(f"{self.path}: {self.rows.autos} rows are autocorrelations: left out")
-
-    def __repr__(self) -> str:
-        times, channels, baselines = self.shape
-        return (
-            f"MeasurementSet({self.path}, {self.column}: {self.frame.telescope}, {times} times, {channels} channels, "
-            f"{baselines} baselines, {len(self.frame.layout)} stations, {self.beam_state})"
-        )
+        self._say_autos()
 
     @property
-    def shape(self) -> tuple[int, int, int]:
-        """Times, channels, baselines."""
-        return len(self.rows.slots_s), len(self.frame.freq_hz), len(self.rows.antenna1)
-
-    @property
-    def freq_hz(self) -> Float:
-        """Channel centres, Hz (F,), ascending."""
-        return self.frame.freq_hz
-
-    def observation(self) -> Recorded:
-        """The observation that the set holds, for a `Scene` that is predicted with its times, channels and UVW.
-
-        Raises `InputError` where the UVW are not those of stations, or integrations are not equally long.
-        """
-        with opened(self.path) as table:
-            parts = [self._coordinates(table, times) for times in self._steps()]
-        return recorded(self.path, self.frame, self.rows, parts)
-
-    def blocks(self) -> Iterator[Visibilities]:
-        """Blocks in order of time, all channels each."""
-        with opened(self.path) as table:
-            for times in self._steps():
-                yield self._block(table, times)
+    def _which(self) -> str:  # type: ignore[override]
+        return f", {self.column}"
 
     def part(self, block: Visibilities) -> Visibilities:
         """The visibilities of the times and channels of another block; raises `InputError` where it has others."""
-        with opened(self.path) as table:
-            return self._block(table, *self._where(block))
+        return self._block(*self._where(block))
 
     def sampling(self, block: Visibilities) -> Sampling:
         """The coordinates of the times and channels of another block, with the UVW of the set."""
         times, channels = self._where(block)
-        with opened(self.path) as table:
-            return self._coordinates(table, times).at.block(slice(None), channels)
+        return self._coordinates(times).at.block(slice(None), channels)
 
     def _where(self, block: Visibilities) -> tuple[slice, slice]:
         """Where the times and channels of a block are."""
@@ -115,9 +83,6 @@ class MeasurementSet(VisibilitySet):
                 raise InputError(f"the visibilities are of other {what} than {self.path}")
             found.append(step)
         return found[0], found[1]
-
-    def _steps(self) -> list[slice]:
-        return self.rows.steps(BLOCK_BYTES, len(self.freq_hz))
 
     @checked
     def write(self, column: str, blocks: VisibilitySet | Iterable[Visibilities], overwrite: bool = False) -> None:
@@ -187,15 +152,16 @@ class MeasurementSet(VisibilitySet):
         if "complex" not in kind:
             raise InputError(f"{self.path}: column {self.column} holds {kind}, not visibilities")
 
-    def _block(self, table: Any, times: slice, channels: slice = slice(None)) -> Visibilities:
-        where, numbers = self._coordinates(table, times), self.rows.of(times)
+    def _block(self, times: slice, channels: slice = slice(None)) -> Visibilities:
+        where, numbers = self._coordinates(times), self.rows.of(times)
         frame = self.frame.of(channels)
         where = where._replace(at=where.at.block(slice(None), channels))
-        flags = self._cube(table, "FLAG", numbers, channels).astype(bool)
-        if "FLAG_ROW" in table.columns():
-            flags = flags | at_rows(table, "FLAG_ROW", numbers).astype(bool)[:, None, None]
-        data = self._cube(table, self.column, numbers, channels)
-        weight = self._weight(table, numbers, channels)
+        with opened(self.path) as table:
+            flags = self._cube(table, "FLAG", numbers, channels).astype(bool)
+            if "FLAG_ROW" in table.columns():
+                flags = flags | at_rows(table, "FLAG_ROW", numbers).astype(bool)[:, None, None]
+            data = self._cube(table, self.column, numbers, channels)
+            weight = self._weight(table, numbers, channels)
         return block_of(frame, self.rows, times, where, data, flags, weight, self.beam_state)
 
     def _cube(self, table: Any, name: str, numbers: Int, channels: slice = slice(None)) -> Any:
@@ -220,9 +186,10 @@ class MeasurementSet(VisibilitySet):
         values = np.asarray(values, float)
         return np.where(np.isfinite(values) & (values > 0), values, 0.0)
 
-    def _coordinates(self, table: Any, times: slice) -> Where:
+    def _coordinates(self, times: slice) -> Where:
         numbers = self.rows.of(times)
-        one, two, uvw = (at_rows(table, name, numbers) for name in ("ANTENNA1", "ANTENNA2", "UVW"))
+        with opened(self.path) as table:
+            one, two, uvw = (at_rows(table, name, numbers) for name in ("ANTENNA1", "ANTENNA2", "UVW"))
         return coordinates(self.path, self.frame, self.rows, times, one, two, uvw)
 
     def _same(self, kept: Store) -> None:

@@ -12,18 +12,17 @@ import numpy as np
 from instrument import zarr_tree
 from instrument.beam_state import BeamState
 from instrument.checked import checked
-from instrument.errors import FileError, InputError, warn
-from instrument.files.by_rows import Rows, Where, block_of, coordinates, in_time, recorded
+from instrument.errors import FileError, InputError
+from instrument.files.by_rows import RowFile, Rows, Where, block_of, coordinates, in_time
 from instrument.files.ms_frame import EQUATORIAL, NAMES, Frame, beam_state_of, beam_words, correlated, distinct
 from instrument.files_in import harmless
 from instrument.memory import afford
 from instrument.msv4 import ANTENNAS, UNIX_S, library, tree_of
 from instrument.observe.layout import Layout
-from instrument.observe.recorded import Recorded
 from instrument.store import FORMAT
 from instrument.units import Direction, Float, Int
 from instrument.visibilities import Visibilities, VisibilitySet
-from instrument.visibility_sets import BLOCK_BYTES, as_one
+from instrument.visibility_sets import as_one
 from instrument.whole_file import whole_folder
 
 KINDS = {name: kind for kind, name in NAMES.items()}
@@ -67,7 +66,7 @@ def write_msv4(
 
 
 @checked
-class Msv4File(VisibilitySet):
+class Msv4File(RowFile):
     """One measurement set of version 4 in a Zarr folder, in blocks of at most 64 MB of data (extras `xarray`, `zarr`).
 
     `name` chooses where a processing set holds several, `group` the data of one that has more than "base". Baselines
@@ -92,40 +91,7 @@ class Msv4File(VisibilitySet):
             self.frame = _frame(self.path, node, self.group)
             self.beam_state: BeamState = beam_state_of(node.attrs.get(BEAM, {}), self.path)
             self.rows, self._one, self._two, self._uvw = self._all_rows()
-        if self.rows.autos:
-            warn(f"{self.path}: {self.rows.autos} rows are autocorrelations: left out")
-
-    def __repr__(self) -> str:
-        times, channels, baselines = self.shape
-        return (
-            f"Msv4File({self.path}: {self.frame.telescope}, {times} times, {channels} channels, {baselines} baselines, "
-            f"{len(self.frame.layout)} stations, {self.beam_state})"
-        )
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Times, channels, baselines."""
-        return len(self.rows.slots_s), len(self.frame.freq_hz), len(self.rows.antenna1)
-
-    @property
-    def freq_hz(self) -> Float:
-        """Channel centres, Hz (F,), ascending."""
-        return self.frame.freq_hz
-
-    def observation(self) -> Recorded:
-        """The observation that the set holds, for a `Scene` that is predicted with its times, channels and UVW.
-
-        Raises `InputError` where the UVW are not those of stations, or integrations are not equally long.
-        """
-        return recorded(self.path, self.frame, self.rows, [self._coordinates(times) for times in self._steps()])
-
-    def blocks(self) -> Iterator[Visibilities]:
-        """Blocks in order of time, all channels each."""
-        for times in self._steps():
-            yield self._block(times)
-
-    def _steps(self) -> list[slice]:
-        return self.rows.steps(BLOCK_BYTES, len(self.freq_hz))
+        self._say_autos()
 
     def _all_rows(self) -> tuple[Rows, Int, Int, Float]:
         """All pairs of a time and a baseline as rows, those with UVW."""

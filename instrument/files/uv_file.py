@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -12,16 +11,14 @@ from instrument import h5
 from instrument.beam_state import BeamState
 from instrument.checked import checked
 from instrument.errors import FileError, InputError, warn
-from instrument.files.by_rows import Rows, Where, block_of, coordinates, in_time, recorded
+from instrument.files.by_rows import RowFile, Rows, Where, block_of, coordinates, in_time
 from instrument.files.ms_frame import Frame, beam_state_of, correlated, distinct, one_of
 from instrument.files.uv_data import CORRELATIONS, library, told
 from instrument.files_in import harmless, open_regular
 from instrument.observe.directions import LIGHT
 from instrument.observe.layout import Layout
-from instrument.observe.recorded import Recorded
-from instrument.units import Direction, Float, Int, direction
-from instrument.visibilities import Visibilities, VisibilitySet
-from instrument.visibility_sets import BLOCK_BYTES
+from instrument.units import Direction, Int, direction
+from instrument.visibilities import Visibilities
 
 JD_OF_MJD = 2400000.5
 MEAN, SUM = "avg", "sum"  # of xx and yy, which is Stokes I
@@ -29,7 +26,7 @@ WHAT = "UVFITS or UVH5 file"
 
 
 @checked
-class UVFile(VisibilitySet):
+class UVFile(RowFile):
     """One window and phase centre of a UVFITS or UVH5 file, in blocks of at most 64 MB of data (extra `uv`, pyuvdata).
 
     Rows may stand in any order, times be irregular, baselines missing (they are flagged), antenna numbers have gaps:
@@ -57,40 +54,7 @@ class UVFile(VisibilitySet):
         self.doubled = uv.pol_convention == SUM
         self.rows, self._one, self._two = _rows(self.path, uv, which)
         self._uvw = None if self.drift else np.asarray(uv.uvw_array, float)
-        if self.rows.autos:
-            warn(f"{self.path}: {self.rows.autos} rows are autocorrelations: left out")
-
-    def __repr__(self) -> str:
-        times, channels, baselines = self.shape
-        return (
-            f"UVFile({self.path}: {self.frame.telescope}, {times} times, {channels} channels, {baselines} baselines, "
-            f"{len(self.frame.layout)} stations, {self.beam_state})"
-        )
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Times, channels, baselines."""
-        return len(self.rows.slots_s), len(self.frame.freq_hz), len(self.rows.antenna1)
-
-    @property
-    def freq_hz(self) -> Float:
-        """Channel centres, Hz (F,), ascending."""
-        return self.frame.freq_hz
-
-    def observation(self) -> Recorded:
-        """The observation that the file holds, for a `Scene` that is predicted with its times, channels and UVW.
-
-        Raises `InputError` where the UVW are not those of stations, or integrations are not equally long.
-        """
-        return recorded(self.path, self.frame, self.rows, [self._coordinates(times) for times in self._steps()])
-
-    def blocks(self) -> Iterator[Visibilities]:
-        """Blocks in order of time, all channels each."""
-        for times in self._steps():
-            yield self._block(times)
-
-    def _steps(self) -> list[slice]:
-        return self.rows.steps(BLOCK_BYTES, len(self.freq_hz))
+        self._say_autos()
 
     def _coordinates(self, times: slice) -> Where:
         numbers = self.rows.of(times)

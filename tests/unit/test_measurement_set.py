@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import instrument
 from instrument import InputError
 from instrument.errors import FileError, InstrumentWarning
-from instrument.files import measurement_set
+from instrument.files import by_rows
 from instrument.files.measurement_set import MeasurementSet
 from instrument.files.ms_frame import TO_CIRCULAR
 from instrument.observe.sampling import Sampling, times_of
@@ -166,7 +166,7 @@ def test_columns_come_back_to_the_bit_in_blocks_of_any_size(tmp_path, layout, wh
     small_set.write(tmp_path / "a.MS", layout, [x[order] for x in rows], FREQ, data[order])
     one = MeasurementSet(tmp_path / "a.MS")
     plain = next(one.blocks())
-    monkeypatch.setattr(measurement_set, "BLOCK_BYTES", 64 * len(A) * len(FREQ) * 2)
+    monkeypatch.setattr(by_rows, "BLOCK_BYTES", 64 * len(A) * len(FREQ) * 2)
     assert [len(b.at.slots_s) for b in one.blocks()] == [2, 2]
     one.write("TWICE", (b.with_data(2 * b.data) for b in one.blocks()))
     twice = list(MeasurementSet(tmp_path / "a.MS", column="TWICE").blocks())

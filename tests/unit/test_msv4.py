@@ -11,7 +11,7 @@ import instrument
 from instrument import Direction, InputError, Msv4File, Observation, PointSky, Scene, msv4, write_msv4
 from instrument.beam_state import BeamState
 from instrument.errors import FileError, InstrumentWarning
-from instrument.files import msv4_file
+from instrument.files import by_rows
 from instrument.files.ms_frame import TO_CIRCULAR
 
 xarray = pytest.importorskip("xarray", reason="the extra 'xarray'")
@@ -112,7 +112,7 @@ def test_sets_of_others_circular_padded_backwards_with_autocorrelations_and_seve
         found = whole(changed(tmp_path, good, padded))
     assert np.array_equal(found.data[0], good.data[0, :, :5]) and len(found.antenna1) == 5
     assert np.argwhere(np.broadcast_to(found.flag, found.data.shape[:3])[:, 0]).tolist() == [[1, 2]]
-    monkeypatch.setattr(msv4_file, "BLOCK_BYTES", 2 * 64 * 6 * 3)
+    monkeypatch.setattr(by_rows, "BLOCK_BYTES", 2 * 64 * 6 * 3)
     write_msv4(tmp_path / "a.zarr", good)
     blocks = list(Msv4File(tmp_path / "a.zarr").blocks())
     assert [len(b.at.slots_s) for b in blocks] == [2, 2, 1]

@@ -15,7 +15,7 @@ import instrument
 from instrument import Direction, Imager, InputError, Observation, PointSky, Scene, UVFile, write_uv
 from instrument.beam_state import BeamState
 from instrument.errors import FileError, InstrumentWarning
-from instrument.files import uv_data, uv_file
+from instrument.files import by_rows, uv_data
 from instrument.files.ms_frame import TO_CIRCULAR
 
 pyuvdata = pytest.importorskip("pyuvdata", reason="the extra 'uv'")
@@ -241,7 +241,7 @@ def test_circular_feeds_two_correlations_and_sums_as_stokes_i(tmp_path, made):
 def test_channels_backwards_and_blocks_smaller_than_the_file_are_the_same(tmp_path, made, monkeypatch):
     path = changed(tmp_path, made, lambda uv: uv.reorder_freqs(channel_order="-freq"))
     assert np.array_equal(whole(path).data, made.data) and np.array_equal(whole(path).freq_hz, made.freq_hz)
-    monkeypatch.setattr(uv_file, "BLOCK_BYTES", 2 * 64 * 6 * 3)
+    monkeypatch.setattr(by_rows, "BLOCK_BYTES", 2 * 64 * 6 * 3)
     for name in (path, tmp_path / "a.uvfits"):
         write_uv(tmp_path / "a.uvfits", made, overwrite=True, precision="double")
         blocks = list(UVFile(name).blocks())
