@@ -106,10 +106,10 @@ def _add_contests(verbs: Any) -> None:
 
 
 def _add_data(verb: argparse.ArgumentParser, name: str) -> None:
-    verb.add_argument("--data", metavar="SET.MS", required=True, help="the Measurement Set")
-    verb.add_argument("--column", default="DATA", metavar="COLUMN", help="of the visibilities (default: DATA)")
+    verb.add_argument("--data", metavar="SET.MS", required=True, help="the Measurement Set, UVFITS, UVH5 or Zarr")
+    verb.add_argument("--column", metavar="COLUMN", help="of the visibilities (default: DATA)")
     if name in WRITES:
-        verb.add_argument("--into", metavar="COLUMN", help=f"to write (default: {WRITES[name][1]})")
+        verb.add_argument("--into", metavar="COLUMN", help=f"to write (default: {WRITES[name][1]}), or a new file")
     verb.add_argument("--window", type=int, metavar="N", help="spectral window, where the set has several")
     verb.add_argument("--field", type=int, metavar="N", help="field, where the set has several")
     verb.add_argument("--no-verify", action="store_true", help="leave out the check against the direct sum")

@@ -27,11 +27,11 @@ def whole_file(path: str | os.PathLike[str], overwrite: bool = False) -> Iterato
     """
     target = Path(path)
     private: Path | None = None
-    _free(target, overwrite)
+    free_file(target, overwrite)
     try:
         private = Path(tempfile.mkdtemp(prefix=".partial-", dir=target.parent))
         yield private / target.name
-        _free(target, overwrite)  # it may have come meanwhile
+        free_file(target, overwrite)  # it may have come meanwhile
         (private / target.name).replace(target)
     except OSError as error:
         why = error.strerror or str(error).partition("\n")[0] or type(error).__name__
@@ -81,7 +81,8 @@ def free_folder(target: Path, mark: str, overwrite: bool) -> None:
         raise InputError(f"{target} exists: give overwrite=True, or another name")
 
 
-def _free(target: Path, overwrite: bool) -> None:
+def free_file(target: Path, overwrite: bool) -> None:
+    """Raise `InputError` where `whole_file` would."""
     if os.path.lexists(target) and (not overwrite or (target.is_dir() and not target.is_symlink())):
         remedy = "choose another name" if target.is_dir() else "give overwrite=True, or another name"
         raise InputError(f"{target} exists: {remedy}")

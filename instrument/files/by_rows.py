@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -16,11 +16,12 @@ from instrument.observe.closure import stations_seen
 from instrument.observe.directions import earth_frame
 from instrument.observe.recorded import Recorded
 from instrument.observe.sampling import Sampling, times_of
-from instrument.units import Bool, Complex, Float, Int
+from instrument.units import Bool, Float, Int
 from instrument.visibilities import Visibilities, VisibilitySet
 from instrument.visibility_sets import BLOCK_BYTES
 
 SAME_S = 1e-3  # times as near as this are one
+CELLS = 32768  # visibilities turned into matrices at once
 FAR = 0.01  # 0.6 deg: precession from J2000 to 2050 is 0.7
 
 
@@ -73,6 +74,12 @@ class RowFile(VisibilitySet):
         )
 
     _which = ""  # of what there is in the file, for the text
+    column = ""  # where it has several
+
+    @property
+    def named(self) -> str:
+        """The file, and the column where it has several."""
+        return f"{self.column} of {self.path}" if self.column else self.path
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -89,12 +96,36 @@ class RowFile(VisibilitySet):
 
         Raises `InputError` where the UVW are not those of stations, or integrations are not equally long.
         """
-        return recorded(self.path, self.frame, self.rows, [self._coordinates(times) for times in self._steps()])
+        return recorded(self.path, self.frame, self.rows, (self._coordinates(times) for times in self._steps()))
+
+    def part(self, block: Visibilities, which: Int | None = None) -> Visibilities:
+        """The visibilities of the times and channels of another block, all baselines of the file or some, by number.
+
+        Raises `InputError` for times and channels that the file has not.
+        """
+        return self._block(*self._where(block), which)
+
+    def sampling(self, block: Visibilities) -> Sampling:
+        """The coordinates of the times and channels of another block, with the UVW of the file."""
+        times, channels = self._where(block)
+        return self._coordinates(times).at.block(slice(None), channels)
+
+    def _where(self, block: Visibilities) -> tuple[slice, slice]:
+        """Where the times and channels of a block are."""
+        found = []
+        asked = (block.at.slots_s, self.rows.slots_s, SAME_S, "times"), (block.freq_hz, self.freq_hz, 1.0, "channels")
+        for values, known, same, what in asked:
+            first = int(np.abs(known - values[0]).argmin())
+            step = slice(first, first + len(values))
+            if len(known[step]) < len(values) or np.abs(known[step] - values).max() > same:
+                raise InputError(f"the visibilities are of other {what} than {self.path}")
+            found.append(step)
+        return found[0], found[1]
 
     def blocks(self) -> Iterator[Visibilities]:
         """Blocks in order of time, all channels each."""
         for times in self._steps():
-            yield self._block(times)
+            yield self._block(times, slice(None))
 
     def _steps(self) -> list[slice]:
         return self.rows.steps(BLOCK_BYTES, len(self.freq_hz))
@@ -107,22 +138,31 @@ class RowFile(VisibilitySet):
     def _coordinates(self, times: slice) -> Where:
         """Coordinates of some times."""
 
+    def _block(self, times: slice, channels: slice, which: Int | None = None) -> Visibilities:
+        """The block of some times, channels and baselines."""
+        where = self._coordinates(times)
+        return block_of(self, times, channels, where, self._cells(self.rows.of(times), channels), which)
+
     @abstractmethod
-    def _block(self, times: slice) -> Visibilities:
-        """The block of some times."""
+    def _cells(self, numbers: Int, channels: slice) -> Cells:
+        """What the file has of some rows and channels."""
 
 
-def in_time(numbers: Int, time: Float, one: Int, two: Int, stations: int, path: str) -> Rows:
-    """Rows of cross-correlations in order of time, `interval_s` still those of nothing."""
+def pairs_of(one: Int, two: Int, stations: int, path: str) -> Int:
+    """The baselines that rows are of, each once, as lower station times `stations` plus the higher."""
+    if one.size and (min(one.min(), two.min()) < 0 or max(one.max(), two.max()) >= stations):
+        raise FileError(f"{path}: rows are of station {max(one.max(), two.max())}, of {stations} that are described")
+    return np.unique(np.minimum(one, two).astype(np.int64) * stations + np.maximum(one, two))
+
+
+def in_time(numbers: Int, time: Float, pairs: Int, stations: int, path: str) -> Rows:
+    """Rows of cross-correlations, of these `pairs_of`, in order of time; `interval_s` still those of nothing."""
     if not np.isfinite(time).all():
         raise FileError(f"{path}: TIME is not finite")
-    if min(one.min(), two.min()) < 0 or max(one.max(), two.max()) >= stations:
-        raise FileError(f"{path}: rows are of station {max(one.max(), two.max())}, of {stations} that are described")
     if np.any(np.diff(time) < 0):
         order = np.argsort(time, kind="stable")
-        numbers, time, one, two = numbers[order], time[order], one[order], two[order]
+        numbers, time = numbers[order], time[order]
     begins = np.append(np.flatnonzero(np.diff(time, prepend=-np.inf) > SAME_S), len(time))
-    pairs = np.unique(np.minimum(one, two).astype(np.int64) * stations + np.maximum(one, two))
     slots = time[begins[:-1]]
     return Rows(numbers, begins, slots, np.zeros(len(slots)), pairs // stations, pairs % stations, 0)
 
@@ -181,45 +221,69 @@ def _compare(path: str, own: Float, ours: Float) -> None:
         )
 
 
+class Cells(NamedTuple):
+    """What a file has of some rows: data, flags and weights (N, F, n) of its channels and correlations, ascending."""
+
+    data: Any
+    flag: Any
+    weight: Any
+
+
 def block_of(
-    frame: Frame, rows: Rows, times: slice, where: Where, data: Complex, flag: Bool, weight: Float, state: BeamState
+    file: RowFile, times: slice, channels: slice, where: Where, cells: Cells, which: Int | None = None
 ) -> Visibilities:
-    """The block of some times, of data, flags and weights (N, F, n) of its rows as the file has them."""
-    shape, turned = (times.stop - times.start, len(rows.antenna1)), where.turned
+    """The block of some times and channels, of its rows as the file has them; of the baselines `which`, or of all.
 
-    def grid(values: Any, lacking: Any) -> Any:
-        out = np.full((shape[0] * shape[1], *values.shape[1:]), lacking, values.dtype)
-        out[where.place] = values
-        return np.moveaxis(out.reshape(*shape, *values.shape[1:]), 1, 2)
-
-    data, flag, weight = frame.linear(data), frame.spread(flag, True), frame.spread(weight, 0.0)
-    if turned.any():
-        data[turned] = np.conj(np.swapaxes(data[turned], -1, -2))
-        flag, weight = np.array(flag), np.array(weight)
-        for x in (flag, weight):
-            x[turned] = np.swapaxes(x[turned], -1, -2)
+    A weight that is not a number above 0 is 0; one weight and flag of each visibility where correlations are alike.
+    """
+    rows, frame, every = file.rows, file.frame.of(channels), len(file.rows.antenna1)
+    chosen = np.arange(every) if which is None else which
+    among = np.full(every, -1)
+    among[chosen] = np.arange(len(chosen))
+    use = np.flatnonzero(among[where.place % every] >= 0)
+    alike = [frame.alike(values) for values in cells]
+    shape = (times.stop - times.start, len(frame.freq_hz), len(chosen))
+    data = np.zeros((*shape, 2, 2), complex)
+    flag, weight = (
+        np.full(shape if same else data.shape, lacking) for same, lacking in zip(alike[1:], (True, 0.0), strict=True)
+    )
+    step = max(1, CELLS // max(shape[1], 1))
+    for first in range(0, len(use), step):
+        some = use[first : first + step]
+        to = where.place[some] // every, slice(None), among[where.place[some] % every]
+        turned = where.turned[some]
+        clean = np.asarray(cells.weight[some], float)
+        clean = np.where(np.isfinite(clean) & (clean > 0), clean, 0.0)
+        found = frame.linear(cells.data[some])
+        found[turned] = np.conj(np.swapaxes(found[turned], -1, -2))
+        data[to] = found
+        for filled, values, lacking in ((flag, cells.flag[some].astype(bool), True), (weight, clean, 0.0)):
+            spread = frame.spread(values, lacking)
+            if filled.ndim == len(shape):
+                filled[to] = spread[..., 0, 0]
+            else:
+                filled[to] = np.where(turned[:, None, None, None], np.swapaxes(spread, -1, -2), spread)
+    uvw = where.given_uvw_m
     return Visibilities(
-        data=grid(data, 0.0), at=where.at, antenna1=rows.antenna1, antenna2=rows.antenna2,
-        interval_s=rows.interval_s[times], width_hz=frame.width_hz, weight=short(grid(weight, 0.0)),
-        flag=short(grid(flag, True)), beam_state=state, given_uvw_m=where.given_uvw_m,
+        data=data, at=where.at.block(slice(None), channels), antenna1=rows.antenna1[chosen],
+        antenna2=rows.antenna2[chosen], interval_s=rows.interval_s[times], width_hz=frame.width_hz, weight=weight,
+        flag=flag, beam_state=file.beam_state, given_uvw_m=None if uvw is None else uvw[:, chosen],
     )  # fmt: skip
 
 
-def recorded(path: str, frame: Frame, rows: Rows, parts: list[Where]) -> Recorded:
+def recorded(path: str, frame: Frame, rows: Rows, parts: Iterable[Where]) -> Recorded:
     """The observation of a file, of the coordinates of all its times; raises `InputError` where it is none to predict.
 
     That is where the UVW are not those of stations, or integrations are not equally long.
     """
-    if any(part.given_uvw_m is not None for part in parts):
-        raise InputError(f"{path}: its UVW do not close around triangles of stations: nothing is predicted")
     if np.ptp(rows.interval_s) > SAME_S:
         raise InputError(f"{path}: integrations of {rows.interval_s.min():g} to {rows.interval_s.max():g} s")
-    own, width = np.concatenate([part.at.uvw_m for part in parts]), frame.width_hz
-    at = replace(parts[0].at, slots_s=rows.slots_s, own_uvw_m=own)
+    first, found, width = None, [], frame.width_hz
+    for part in parts:
+        if part.given_uvw_m is not None:
+            raise InputError(f"{path}: its UVW do not close around triangles of stations: nothing is predicted")
+        first = first or part.at
+        found.append(part.at.uvw_m)
+    assert first is not None
+    at = replace(first, slots_s=rows.slots_s, own_uvw_m=np.concatenate(found))
     return Recorded.of(at, float(rows.interval_s[0]), float(width[0]) if np.ptp(width) == 0 else None)
-
-
-def short(values: Any) -> Any:
-    """Values of correlations (T, F, B, 2, 2) as (T, F, B) where all four are alike."""
-    first = values[..., 0, 0]
-    return first.copy() if np.all(values == first[..., None, None]) else values

@@ -13,17 +13,16 @@ import numpy as np
 from instrument.checked import checked
 from instrument.errors import FileError, InputError
 from instrument.files import ms_create
-from instrument.files.by_rows import SAME_S, RowFile, Where, block_of, coordinates, places
+from instrument.files.by_rows import SAME_S, Cells, RowFile, Where, coordinates, places
 from instrument.files.ms_frame import beam_state_of, beam_words, frame_of
-from instrument.files.ms_rows import add_column, at_rows, filled, in_parts, put_rows, rows_of
+from instrument.files.ms_rows import add_column, at_rows, filled, kinds_of, put_rows, rows_of
 from instrument.files.ms_tables import demand, opened, told
 from instrument.model import Instrument
-from instrument.observe.sampling import Sampling
 from instrument.store import Store
-from instrument.units import Float, Int
+from instrument.units import Int
 from instrument.visibilities import Visibilities, VisibilitySet
 from instrument.visibility_sets import VisibilityFile, as_set
-from instrument.whole_file import free_folder, whole_folder
+from instrument.whole_file import whole_folder
 
 SAME_RAD = 1e-9  # phase centres as near as this are one
 NEEDED = ("TIME", "INTERVAL", "ANTENNA1", "ANTENNA2", "DATA_DESC_ID", "FIELD_ID", "UVW", "FLAG")
@@ -52,7 +51,7 @@ class MeasurementSet(RowFile):
             self._known(table)
             if not table.nrow():
                 raise FileError(f"{self.path} has no rows")
-            described, fields = (np.unique(values) for values in in_parts(table, ("DATA_DESC_ID", "FIELD_ID")))
+            described, fields = (kinds_of(table, name) for name in ("DATA_DESC_ID", "FIELD_ID"))
             self.frame = frame_of(self.path, window, field, described, fields)
             self.rows = rows_of(table, self.frame, self.path)
             self.weights = next((n for n in ("WEIGHT_SPECTRUM", "WEIGHT") if filled(table, n, self.rows)), "")
@@ -62,27 +61,6 @@ class MeasurementSet(RowFile):
     @property
     def _which(self) -> str:  # type: ignore[override]
         return f", {self.column}"
-
-    def part(self, block: Visibilities) -> Visibilities:
-        """The visibilities of the times and channels of another block; raises `InputError` where it has others."""
-        return self._block(*self._where(block))
-
-    def sampling(self, block: Visibilities) -> Sampling:
-        """The coordinates of the times and channels of another block, with the UVW of the set."""
-        times, channels = self._where(block)
-        return self._coordinates(times).at.block(slice(None), channels)
-
-    def _where(self, block: Visibilities) -> tuple[slice, slice]:
-        """Where the times and channels of a block are."""
-        found = []
-        asked = (block.at.slots_s, self.rows.slots_s, SAME_S, "times"), (block.freq_hz, self.freq_hz, 1.0, "channels")
-        for values, known, same, what in asked:
-            first = int(np.abs(known - values[0]).argmin())
-            step = slice(first, first + len(values))
-            if len(known[step]) < len(values) or np.abs(known[step] - values).max() > same:
-                raise InputError(f"the visibilities are of other {what} than {self.path}")
-            found.append(step)
-        return found[0], found[1]
 
     @checked
     def write(self, column: str, blocks: VisibilitySet | Iterable[Visibilities], overwrite: bool = False) -> None:
@@ -114,11 +92,6 @@ class MeasurementSet(RowFile):
                 raise InputError(f"{path} has a column {column}: name another one, or allow to overwrite it (--force)")
         if column in NEEDED or column in ("TIME_CENTROID", "EXPOSURE", "WEIGHT", "SIGMA", "WEIGHT_SPECTRUM"):
             raise InputError(f"{column} is no column for visibilities")
-
-    @staticmethod
-    def free(path: str, overwrite: bool) -> None:
-        """Raise `InputError` where a new set may not stand."""
-        free_folder(Path(path), MARK, overwrite)
 
     @classmethod
     def create(
@@ -152,39 +125,31 @@ class MeasurementSet(RowFile):
         if "complex" not in kind:
             raise InputError(f"{self.path}: column {self.column} holds {kind}, not visibilities")
 
-    def _block(self, times: slice, channels: slice = slice(None)) -> Visibilities:
-        where, numbers = self._coordinates(times), self.rows.of(times)
-        frame = self.frame.of(channels)
-        where = where._replace(at=where.at.block(slice(None), channels))
+    def _cells(self, numbers: Int, channels: slice) -> Cells:
         with opened(self.path) as table:
-            flags = self._cube(table, "FLAG", numbers, channels).astype(bool)
+            flags = self._cube(table, "FLAG", numbers, channels)
             if "FLAG_ROW" in table.columns():
-                flags = flags | at_rows(table, "FLAG_ROW", numbers).astype(bool)[:, None, None]
+                flags = flags.astype(bool) | at_rows(table, "FLAG_ROW", numbers).astype(bool)[:, None, None]
             data = self._cube(table, self.column, numbers, channels)
-            weight = self._weight(table, numbers, channels)
-        return block_of(frame, self.rows, times, where, data, flags, weight, self.beam_state)
+            return Cells(data, flags, self._weight(table, numbers, channels))
 
     def _cube(self, table: Any, name: str, numbers: Int, channels: slice = slice(None)) -> Any:
         """Values (N, F, n) of a column, channels ascending."""
         count = len(self.frame.freq_hz)
-        first, last, _ = channels.indices(count)
-        inside = slice(count - last, count - first) if self.frame.backwards else slice(first, last)
-        values = at_rows(table, name, numbers, None if last - first == count else inside)
-        want = (len(numbers), last - first, len(self.frame.kinds))
+        inside = self.frame.inside(channels, count)
+        have = inside.stop - inside.start
+        values = at_rows(table, name, numbers, None if have == count else inside)
+        want = (len(numbers), have, len(self.frame.kinds))
         if values.shape != want:
             raise FileError(f"{self.path}: {name} has shape {values.shape}, channels and correlations need {want}")
         return values[:, ::-1] if self.frame.backwards else values
 
-    def _weight(self, table: Any, numbers: Int, channels: slice) -> Float:
+    def _weight(self, table: Any, numbers: Int, channels: slice) -> Any:
         shape = (len(numbers), len(self.frame.freq_hz[channels]), len(self.frame.kinds))
         if self.weights == "WEIGHT_SPECTRUM":
-            values = self._cube(table, self.weights, numbers, channels)
-        elif self.weights == "WEIGHT":
-            values = np.broadcast_to(at_rows(table, "WEIGHT", numbers)[:, None], shape)
-        else:
-            return np.ones(shape)
-        values = np.asarray(values, float)
-        return np.where(np.isfinite(values) & (values > 0), values, 0.0)
+            return self._cube(table, self.weights, numbers, channels)
+        one = at_rows(table, "WEIGHT", numbers)[:, None] if self.weights == "WEIGHT" else np.ones(())
+        return np.broadcast_to(one, shape)
 
     def _coordinates(self, times: slice) -> Where:
         numbers = self.rows.of(times)

@@ -43,6 +43,11 @@ class Frame:
         """The same for some channels."""
         return replace(self, freq_hz=self.freq_hz[channels], width_hz=self.width_hz[channels])
 
+    def inside(self, channels: slice, count: int) -> slice:
+        """Where channels, of `count` in all, stand in the file."""
+        first, last, _ = channels.indices(count)
+        return slice(count - last, count - first) if self.backwards else slice(first, last)
+
     def linear(self, data: Complex) -> Complex:
         """Correlations (..., n) in the order of the file as matrices (..., 2, 2) of receptors p, q.
 
@@ -64,6 +69,14 @@ class Frame:
         for k, kind in enumerate(self.kinds):
             out[..., LINEAR.index(kind)] = values[..., k]
         return out.reshape(*values.shape[:-1], 2, 2)
+
+    def alike(self, values: Any) -> bool:
+        """Whether flags or weights (..., n) of the file are one for all four receptors."""
+        if self.kinds[0] in CIRCULAR:
+            return True
+        return len(self.kinds) == 4 and np.array_equal(
+            values[..., 1:], values[..., :-1], equal_nan=values.dtype != bool
+        )
 
     def correlated(self, data: Complex) -> Complex:
         """Matrices (..., 2, 2) as the correlations (..., n) of the file."""

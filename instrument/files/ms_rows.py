@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from instrument.errors import FileError
-from instrument.files.by_rows import Rows, in_time
+from instrument.files.by_rows import Rows, in_time, pairs_of
 from instrument.files.ms_frame import Frame
 from instrument.files.ms_tables import column, told
 from instrument.units import Complex, Int
 
-AT_ONCE = 1_000_000  # rows of what tells where the rows are
+AT_ONCE = 100_000  # rows of what tells where the rows are
 BLOCK_ROWS = 10_000  # of a new column that are written at once
 
 
-def in_parts(table: Any, names: tuple[str, ...]) -> list[Any]:
-    """Columns of numbers, whole, read in parts."""
-    found: list[Any] = []
-    for name in names:
-        parts = [column(table, name, slice(r, r + AT_ONCE)) for r in range(0, table.nrow(), AT_ONCE)]
-        found.append(np.concatenate(parts))
-    return found
+def parts(table: Any, *names: str) -> Iterator[tuple[int, list[Any]]]:
+    """The number of the first row of a part of the table, and its values of columns of numbers."""
+    for r in range(0, table.nrow(), AT_ONCE):
+        yield r, [column(table, name, slice(r, r + AT_ONCE)) for name in names]
+
+
+def kinds_of(table: Any, name: str) -> Int:
+    """The values that a column of numbers has, each once."""
+    return np.unique(np.concatenate([np.unique(values) for _, (values,) in parts(table, name)]))
 
 
 def filled(table: Any, name: str, rows: Rows) -> bool:
@@ -37,13 +40,21 @@ def filled(table: Any, name: str, rows: Rows) -> bool:
 
 def rows_of(table: Any, frame: Frame, path: str) -> Rows:
     """The rows of the window and field of a frame."""
-    described, fields, time, one, two = in_parts(table, ("DATA_DESC_ID", "FIELD_ID", "TIME", "ANTENNA1", "ANTENNA2"))
-    mine = (described == frame.described) & (fields == frame.field)
-    autos = int((mine & (one == two)).sum())
-    numbers = np.flatnonzero(mine & (one != two))
-    if not len(numbers):
+    stations, autos = len(frame.layout), 0
+    numbers, times, pairs = [], [], []
+    for r, (described, fields, time, one, two) in parts(
+        table, "DATA_DESC_ID", "FIELD_ID", "TIME", "ANTENNA1", "ANTENNA2"
+    ):
+        mine, cross = (described == frame.described) & (fields == frame.field), one != two
+        autos += int((mine & ~cross).sum())
+        here = np.flatnonzero(mine & cross)
+        numbers.append(r + here)
+        times.append(time[here])
+        pairs.append(pairs_of(one[here], two[here], stations, path))
+    whole = [np.concatenate(found) for found in (numbers, times, pairs)]
+    if not len(whole[0]):
         raise FileError(f"{path} has no cross-correlations of this window and field")
-    found = in_time(numbers, time[numbers], one[numbers], two[numbers], len(frame.layout), path)
+    found = in_time(whole[0], whole[1], np.unique(whole[2]), stations, path)
     interval = at_rows(table, "INTERVAL", found.numbers[found.begins[:-1]])
     return found._replace(interval_s=interval, autos=autos)
 
@@ -54,7 +65,7 @@ def at_rows(table: Any, name: str, numbers: Int, channels: slice | None = None) 
     if len(numbers) and numbers[-1] - numbers[0] + 1 == len(numbers) and np.all(np.diff(numbers) == 1):
         where = slice(int(numbers[0]), int(numbers[-1]) + 1)
     with told(f"column {name}"):
-        return np.array(table.getcol(name, (where,) if channels is None else (where, channels)))
+        return np.asarray(table.getcol(name, (where,) if channels is None else (where, channels)))
 
 
 def put_rows(table: Any, name: str, numbers: Int, values: Complex) -> None:

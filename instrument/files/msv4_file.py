@@ -13,7 +13,7 @@ from instrument import zarr_tree
 from instrument.beam_state import BeamState
 from instrument.checked import checked
 from instrument.errors import FileError, InputError
-from instrument.files.by_rows import RowFile, Rows, Where, block_of, coordinates, in_time
+from instrument.files.by_rows import Cells, RowFile, Rows, Where, coordinates, in_time, pairs_of
 from instrument.files.ms_frame import EQUATORIAL, NAMES, Frame, beam_state_of, beam_words, correlated, distinct
 from instrument.files_in import harmless
 from instrument.memory import afford
@@ -105,7 +105,8 @@ class Msv4File(RowFile):
         if not cross.size:
             raise FileError(f"{self.path} has no cross-correlations with UVW")
         seconds = np.repeat(np.asarray(main["time"].values, float) + UNIX_S, len(pairs[0]))
-        rows = in_time(cross, seconds[cross], one[cross], two[cross], len(names), self.path)
+        pairs_seen = pairs_of(one[cross], two[cross], len(names), self.path)
+        rows = in_time(cross, seconds[cross], pairs_seen, len(names), self.path)
         interval = np.full(len(rows.slots_s), float(main["time"].attrs["integration_time"]["data"]))
         if "EFFECTIVE_INTEGRATION_TIME" in main and main["EFFECTIVE_INTEGRATION_TIME"].ndim == 2:
             each = np.asarray(main["EFFECTIVE_INTEGRATION_TIME"].values, float).ravel()
@@ -118,19 +119,17 @@ class Msv4File(RowFile):
         one, two, uvw = self._one[numbers], self._two[numbers], self._uvw[numbers]
         return coordinates(self.path, self.frame, self.rows, times, one, two, uvw)
 
-    def _block(self, times: slice) -> Visibilities:
-        where, numbers = self._coordinates(times), self.rows.of(times)
+    def _cells(self, numbers: Int, channels: slice) -> Cells:
         baselines = self.main.sizes["baseline_id"]
         first, last = int(numbers.min()) // baselines, int(numbers.max()) // baselines + 1
+        some = {"time": slice(first, last), "frequency": self.frame.inside(channels, len(self.freq_hz))}
         found = []
         with _told(self.path):
             for key in ("correlated_data", "flag", "weight"):
-                cube = self.main[self.group[key]].isel(time=slice(first, last)).values
+                cube = self.main[self.group[key]].isel(some).values
                 flat = cube.reshape(-1, *cube.shape[2:])[numbers - first * baselines]
                 found.append(flat[:, ::-1] if self.frame.backwards else flat)
-        data, flag, weight = found[0], found[1].astype(bool), np.asarray(found[2], float)
-        weight = np.where(np.isfinite(weight) & (weight > 0), weight, 0.0)
-        return block_of(self.frame, self.rows, times, where, data, flag, weight, self.beam_state)
+        return Cells(*found)
 
 
 def _chosen(path: str, found: dict[str, Any], name: str | None) -> Any:

@@ -11,7 +11,7 @@ from instrument import h5
 from instrument.beam_state import BeamState
 from instrument.checked import checked
 from instrument.errors import FileError, InputError, warn
-from instrument.files.by_rows import RowFile, Rows, Where, block_of, coordinates, in_time
+from instrument.files.by_rows import Cells, RowFile, Rows, Where, coordinates, in_time, pairs_of
 from instrument.files.ms_frame import Frame, beam_state_of, correlated, distinct, one_of
 from instrument.files.uv_data import CORRELATIONS, library, told
 from instrument.files_in import harmless, open_regular
@@ -61,22 +61,22 @@ class UVFile(RowFile):
         uvw = None if self._uvw is None else self._uvw[numbers]
         return coordinates(self.path, self.frame, self.rows, times, self._one[numbers], self._two[numbers], uvw)
 
-    def _block(self, times: slice) -> Visibilities:
-        where, numbers = self._coordinates(times), self.rows.of(times)
-        order = np.argsort(numbers)
-        some: dict[str, Any] = {"blt_inds": numbers[order], "freq_chans": self.channels}
-        uv = self._read(**some)
-        rows = np.argsort(order)  # as they were asked for
-        step = -1 if self.frame.backwards else 1
-        data, flag, weight = (x[rows][:, ::step] for x in (uv.data_array, uv.flag_array, uv.nsample_array))
-        weight = np.asarray(weight, float)
-        weight = np.where(np.isfinite(weight) & (weight > 0), weight, 0.0)
-        block = block_of(self.frame, self.rows, times, where, data, flag.astype(bool), weight, self.beam_state)
+    def _block(self, times: slice, channels: slice, which: Int | None = None) -> Visibilities:
+        block = super()._block(times, channels, which)
         turned = block.data * 2 if self.doubled else block.data
         if self.drift:
             waves = block.uvw_m[:, None, :, 2] * (block.freq_hz / LIGHT)[:, None]
             turned = turned * np.exp(2j * np.pi * (waves - np.rint(waves)))[..., None, None]
         return block if turned is block.data else block.with_data(turned)
+
+    def _cells(self, numbers: Int, channels: slice) -> Cells:
+        order = np.argsort(numbers)
+        inside = self.frame.inside(channels, len(self.channels))
+        some: dict[str, Any] = {"blt_inds": numbers[order], "freq_chans": self.channels[inside]}
+        uv = self._read(**some)
+        rows = np.argsort(order)  # as they were asked for
+        step = -1 if self.frame.backwards else 1
+        return Cells(*(x[rows][:, ::step] for x in (uv.data_array, uv.flag_array, uv.nsample_array)))
 
     def _read(self, **how: Any) -> Any:
         """What pyuvdata reads."""
@@ -167,7 +167,8 @@ def _rows(path: str, uv: Any, field: int) -> tuple[Rows, Int, Int]:
     if not cross.size:
         raise FileError(f"{path} has no cross-correlations of this phase centre")
     seconds = (np.asarray(uv.time_array, float) - JD_OF_MJD) * 86400.0
-    rows = in_time(cross, seconds[cross], one[cross], two[cross], len(stations), path)
+    pairs = pairs_of(one[cross], two[cross], len(stations), path)
+    rows = in_time(cross, seconds[cross], pairs, len(stations), path)
     interval = np.asarray(uv.integration_time, float)[rows.numbers[rows.begins[:-1]]]
     return rows._replace(interval_s=interval, autos=int((mine & (one == two)).sum())), one, two
 

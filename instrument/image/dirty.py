@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import cached_property
 from typing import Annotated, Any
 
@@ -97,7 +98,7 @@ class _Channel:
 
     def __init__(self, freq_hz: float, pixels: int) -> None:
         self.freq_hz, self.pixels = freq_hz, pixels
-        self.waiting: list[tuple[Visibilities, int, Int | None]] = []  # blocks, the channel in them, their integrations
+        self.waiting: list[tuple[Visibilities, Int | None]] = []  # of this channel alone, and their integrations
         self.count = 0  # visibilities that wait
         self.times = 0  # integrations that wait
         self.comb: Comb | None = None  # once visibilities go to samples
@@ -116,6 +117,14 @@ class _Channel:
     def samples(self) -> int:
         """How many are held."""
         return self.span.samples.count if self.span else 0
+
+
+def _alone(block: Visibilities, f: int) -> Visibilities:
+    """One channel of a block, which does not keep the others in memory."""
+    if block.data.shape[1] == 1:
+        return block
+    one = block.block(slice(None), slice(f, f + 1))
+    return replace(one, data=one.data.copy(), weight=one.weight.copy(), flag=one.flag.copy())
 
 
 class Images(ImageSums):
@@ -149,7 +158,7 @@ class Images(ImageSums):
             if channel.comb is not None and numbers is not None:
                 self._compress(channel, block, f, numbers)
                 continue
-            channel.waiting.append((block, f, numbers))
+            channel.waiting.append((_alone(block, f), numbers))
             channel.sparse = channel.sparse and numbers is not None
             channel.count, channel.times = channel.count + times * baselines, channel.times + times
             self.waiting += times * baselines
@@ -183,9 +192,9 @@ class Images(ImageSums):
             channel.comb = comb if channel.sparse else None
         if not channel.sparse:
             return self._grid(channel)
-        for block, f, numbers in channel.waiting:
+        for block, numbers in channel.waiting:
             assert numbers is not None
-            self._compress(channel, block, f, numbers)
+            self._compress(channel, block, 0, numbers)
         self._taken(channel)
 
     def _taken(self, channel: _Channel) -> None:
@@ -228,10 +237,10 @@ class Images(ImageSums):
     def _grid(self, channel: _Channel) -> None:
         """Grid what waits, visibility by visibility."""
         found = []
-        for block, f, _ in channel.waiting:
-            uvw, weight, use = self._chosen(block, f)
+        for block, _ in channel.waiting:
+            uvw, weight, use = self._chosen(block, 0)
             # of no weight, the data may be NaN
-            values = np.where(weight > 0, mueller.stokes(block.data[:, f][use]), 0.0)
+            values = np.where(weight > 0, mueller.stokes(block.data[:, 0][use]), 0.0)
             found.append((uvw, weight, values))
         self._taken(channel)
         most = max((weight.shape[1] for _, weight, _ in found), default=1)

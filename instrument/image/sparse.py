@@ -30,7 +30,7 @@ PAYS = 0.5  # samples in place of as many visibilities, at most
 def share(problem: Problem, imager: Any) -> float:
     """Samples that are gridded for each visibility of the middle channel of a run, for its plan; 1: all as they are."""
     times, channels, _ = problem.shape
-    if times <= FEW or np.ptp(np.diff(problem.at.slots_s)) > 1e-5:
+    if not regular(problem):
         return 1.0
     freq_hz = float(problem.at.freq_hz[channels // 2])
     first, places = problem.at.at_centre().block(slice(0, 1), slice(0, 1)), problem.at.layout.positions_m
@@ -42,6 +42,13 @@ def share(problem: Problem, imager: Any) -> float:
     each = float(np.mean(1 / steps(rates, problem.interval_s))) if use.any() else 1.0
     found = each + taps_for(BETWEEN * imager.accuracy)[0] / times
     return found if found <= PAYS else 1.0
+
+
+def regular(problem: Problem) -> bool:
+    """Whether a run may bring visibilities to samples: regular times, many, with UVW that are worked out."""
+    at = problem.at
+    apart = at.own_uvw_m is not None or at.seen_centre is not None
+    return not apart and len(at.slots_s) > FEW and bool(np.ptp(np.diff(at.slots_s)) <= 1e-5)
 
 
 @dataclass(frozen=True)

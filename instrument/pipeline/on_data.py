@@ -1,10 +1,11 @@
-"""The verbs `predict`, `calibrate`, `image` and `subtract`: scenes made to work on the visibilities of a set."""
+"""The verbs `predict`, `calibrate`, `image` and `subtract`: scenes made to work on the visibilities of a file."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from instrument.errors import InputError
+from instrument.files.formats import ENDINGS, has_columns, names_file
 
 OWN = ("name", "title", "seed", "tolerance", "engine", "instrument", "sky")
 STAGES = {"predict": (), "calibrate": ("calibrate",), "image": ("correct", "image", "analyze"), "subtract": ()}
@@ -22,9 +23,9 @@ HELP = {
 
 
 def tables_on(verb: str, tables: dict[str, Any], data: dict[str, Any], into: str | None, force: bool) -> dict[str, Any]:
-    """The tables of a scene as a verb has them: on the visibilities `data`, whose column `into` is written.
+    """The tables of a scene as a verb has them: on visibilities `data`; `into` is their column, or a new file.
 
-    Raises `InputError` where the scene lacks the table that the verb is about.
+    Raises `InputError` where the scene lacks the table that the verb is about, and where neither is to be had.
     """
     if verb in STAGES[verb] and verb not in tables:
         raise InputError(f"{verb} takes its settings from a table [{verb}], which the scene has not")
@@ -33,4 +34,7 @@ def tables_on(verb: str, tables: dict[str, Any], data: dict[str, Any], into: str
     if verb not in WRITES:
         return out
     what, usual = WRITES[verb]
-    return out | {"into": {"what": what, "column": into or usual, "overwrite": force}}
+    if into is None and not has_columns(data["set"]):
+        raise InputError(f"{data['set']} has no columns to write: give --into a new file, {ENDINGS}")
+    named = {"set": into} if into is not None and names_file(into) else {"column": into or usual}
+    return out | {"into": {"what": what, **named, "overwrite": force}}

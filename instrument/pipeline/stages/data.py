@@ -1,4 +1,4 @@
-"""The table [data]: visibilities that a Measurement Set holds take the place of those that would be simulated."""
+"""The table [data]: visibilities that a file holds take the place of those that would be simulated."""
 
 from __future__ import annotations
 
@@ -9,40 +9,52 @@ from typing import Any
 
 import numpy as np
 
+from instrument import correlations
 from instrument.errors import InputError
-from instrument.files.by_rows import short
-from instrument.files.measurement_set import MeasurementSet
+from instrument.files.by_rows import RowFile
+from instrument.files.formats import source
+from instrument.memory import give_back
 from instrument.observe.recorded import Recorded
 from instrument.pipeline.stage import Running, Stage, StageResult, StageRun
 from instrument.pipeline.work import StageWork
 from instrument.scene import Scene
-from instrument.units import Bool, Int
+from instrument.units import Bool, Int, SkyDirection
 from instrument.visibilities import Visibilities, VisibilitySet
 
 READING = 1.0e-6  # seconds of a visibility
-COPIES = 9  # of a block: as the file has it, as matrices, in the order of the plan; with weights and flags
+STORED = 60.0  # bytes of a visibility as the file has it
+TILES = 50e6  # bytes that the library of sets keeps of what it has read
+TAKEN = 200.0  # of one that is taken: as a matrix, in the order of the plan, with weight and flag
 
 
 class Data(Stage):
-    """Reads the blocks from `column` of the Measurement Set `set`: a window and field where it has several.
+    """Reads the blocks of `set`: a Measurement Set, a UVFITS or UVH5 file, or a set of version 4 in Zarr.
 
-    The observation of the scene is that of the set, with its UVW; the stations are its stations.
+    Chosen are `column`, `window` and `field` of a Measurement Set (DATA, and the only ones); `window`, `field` and the
+    `centre` that a drift scan is phased to of UVFITS and UVH5; `part` and `column` (its group of data, base) of version
+    4. The observation of the scene is that of the set, with its UVW; the stations are its stations.
     """
 
     set: str
-    column: str = "DATA"
+    column: str | None = None
     window: int | None = None
     field: int | None = None
+    part: str | None = None
+    centre: SkyDirection | None = None
 
     @cached_property
-    def source(self) -> MeasurementSet:
+    def source(self) -> RowFile:
         """The set."""
-        return MeasurementSet(self.set, self.column, self.window, self.field)
+        return source(
+            self.set, column=self.column, window=self.window, field=self.field, part=self.part, centre=self.centre
+        )
 
     @cached_property
     def observation(self) -> Recorded:
-        """Its observation."""
-        return self.source.observation()
+        """Its observation; what was read on the way is given back before the run is planned by what is taken."""
+        found = self.source.observation()
+        give_back()
+        return found
 
     def ranges(self) -> tuple[tuple[float, float] | None, ...]:
         """None: what others ask for is read."""
@@ -68,9 +80,10 @@ class Data(Stage):
     def work(self, run: Running) -> StageWork:
         """Data, flags and weights of a block, as the file has them and as they are here."""
         return StageWork(
-            f"from {self.column} of {self.set}",
+            f"from {self.source.named}",
             seconds=READING * run.visibilities,
-            block_bytes=COPIES * 64.0 * float(np.prod(run.block)),
+            held_bytes=TILES,
+            block_bytes=run.block[0] * run.block[1] * (STORED * self.source.shape[2] + TAKEN * run.block[2]),
         )
 
     def start(self, run: Running) -> StageRun:
@@ -114,7 +127,7 @@ class DataResult(StageResult):
 class Seen(VisibilitySet):
     """The data of a set in the blocks, and with the stations and baselines, of a plan; what is missing is flagged."""
 
-    def __init__(self, source: MeasurementSet, run: Running) -> None:
+    def __init__(self, source: RowFile, run: Running) -> None:
         self.source, self.plan = source, run.plan
         problem = run.plan.problem
         theirs, stations = source.frame.layout.names, len(source.frame.layout)
@@ -126,6 +139,8 @@ class Seen(VisibilitySet):
         self.place: Int = np.minimum(np.searchsorted(known, asked), len(known) - 1)
         self.there: Bool = known[self.place] == asked
         self.turned: Bool = one > two
+        self.wanted = np.unique(self.place[self.there])
+        self.straight = np.array_equal(self.place, self.wanted) and bool(self.there.all())
         self.flagged = self.count = 0.0
 
     def blocks(self) -> Iterator[Visibilities]:
@@ -144,22 +159,32 @@ class Seen(VisibilitySet):
 
     def like(self, block: Visibilities) -> Visibilities:
         """The data of the times, channels and baselines of a block, which has the coordinates."""
-        found = self.source.part(block)
-        data = found.data[:, :, self.place]
-        weight, flag = (self._of(x, found.data.shape) for x in (found.weight, found.flag))
+        found = self.source.part(block, self.wanted)
+        data, weight, flag = (self._mine(values) for values in (found.data, found.weight, found.flag))
         if self.turned.any():
             data[:, :, self.turned] = np.conj(np.swapaxes(data[:, :, self.turned], -1, -2))
-        bad = ~self.there[:, None, None] | ~np.isfinite(data)
-        data = np.where(bad, 0.0, data)
-        weight, flag = short(np.where(bad, 0.0, weight)), short(flag | bad)
+            for values in (weight, flag):
+                if values.ndim == data.ndim:
+                    values[:, :, self.turned] = np.swapaxes(values[:, :, self.turned], -1, -2)
+        bad = ~np.isfinite(data)
+        if bad.any():
+            data[bad] = 0.0
+            if np.array_equal(bad.any(axis=(3, 4)), bad.all(axis=(3, 4))):
+                bad = bad[..., 0, 0]
+            else:
+                weight, flag = (
+                    np.broadcast_to(x, data.shape).copy() for x in correlations.alike(weight, flag, data)[:2]
+                )
+            weight[bad], flag[bad] = 0.0, True
+        weight[:, :, ~self.there], flag[:, :, ~self.there] = 0.0, True
         return replace(block, data=data, weight=weight, flag=flag, beam_state=found.beam_state)
 
-    def _of(self, values: Any, shape: tuple[int, ...]) -> Any:
-        """Weights or flags of the baselines asked for, of correlations."""
-        whole = values if values.ndim == len(shape) else values[..., None, None]
-        out = np.broadcast_to(whole, shape)[:, :, self.place].copy()
-        if self.turned.any():
-            out[:, :, self.turned] = np.swapaxes(out[:, :, self.turned], -1, -2)
+    def _mine(self, values: Any) -> Any:
+        """What was found of the baselines `wanted`, as those of the plan; 0 for those that are not there."""
+        if self.straight:
+            return values
+        out = np.zeros((*values.shape[:2], len(self.place), *values.shape[3:]), values.dtype)
+        out[:, :, self.there] = values[:, :, np.searchsorted(self.wanted, self.place[self.there])]
         return out
 
     def looked(self, block: Visibilities) -> None:

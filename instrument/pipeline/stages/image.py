@@ -15,7 +15,7 @@ from instrument.image.base import AnyImager, ImageSums, Kept
 from instrument.image.cube import SolidAngle, StokesCube
 from instrument.image.dirty import ALL_HELD, HELD, WAITING, Imager
 from instrument.image.pixel_map import PixelMap
-from instrument.image.sparse import SAMPLE, share
+from instrument.image.sparse import SAMPLE, regular, share
 from instrument.memory import afford
 from instrument.numbers import brief
 from instrument.observe.directions import LIGHT
@@ -115,6 +115,7 @@ def imaging(imager: AnyImager, run: Running, count: int = 1) -> StageWork:
     weighed = 0.0 if imager.weighting == "natural" else 1.0
     together = min(HELD, chosen / channels)
     gridded = chosen * share(run.plan.problem, imager)
+    sampled = regular(run.plan.problem)
     calls = 5 * max(channels, np.ceil(gridded / HELD))
     seconds = GRIDDING * 5 * gridded + (1 + weighed) * PICKING * run.visibilities + TURNING * calls * imager.pixels**2
     return StageWork(
@@ -123,7 +124,7 @@ def imaging(imager: AnyImager, run: Running, count: int = 1) -> StageWork:
         held_bytes=weighed * channels * plane
         + count * (5 * channels * plane + WAITING * min(run.visibilities, HELD * channels, ALL_HELD))
         # a channel may hold samples as large as two and a half of its images
-        + count * SAMPLE * min(chosen, HELD * channels, max(ALL_HELD, channels * imager.pixels**2 / 4)),
+        + sampled * count * SAMPLE * min(chosen, HELD * channels, max(ALL_HELD, channels * imager.pixels**2 / 4)),
         block_bytes=GRIDDED * together + 8 * 4 * plane + 128.0 * float(np.prod(run.block)),
         finish_bytes=GRIDDED * together + 8 * 4 * plane,
         result_bytes=count * 5 * channels * plane,

@@ -1,7 +1,8 @@
-"""The table [into]: visibilities of a run written into a column of a Measurement Set, or as a new one."""
+"""The table [into]: visibilities of a run written into a column of a Measurement Set, or as a new file."""
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
@@ -10,8 +11,8 @@ from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 
-from instrument.component import Component
 from instrument.errors import InputError
+from instrument.files.formats import ENDINGS, demand_free, has_columns, write
 from instrument.files.measurement_set import MeasurementSet
 from instrument.pipeline.stage import Beside, Running, Stage, StageResult, StageRun
 from instrument.pipeline.stages.data import Seen
@@ -32,8 +33,9 @@ class Into(Stage):
     """Writes `what` is there at the end into `column` of the Measurement Set `set`, that of [data] where none is given.
 
     `what` is "data" (visibilities as the stages before have left them), "model" (what was predicted) or "difference"
-    (data less model). A set that is not that of [data] is made anew, with the tables of its telescope. What is there
-    is overwritten with `overwrite` only. All is worked out and kept beside the set before anything in it is changed.
+    (data less model). A set that is not that of [data] is made anew, with the tables of its telescope; where its name
+    ends in .uvfits, .uvh5 or .zarr it is of that format. What is there is overwritten with `overwrite` only. All is
+    worked out and kept beside the set before anything in it is changed.
     """
 
     after: ClassVar[tuple[str, ...]] = ("data", "noise", "calibrate", "correct", "image", "analyze")
@@ -50,7 +52,9 @@ class Into(Stage):
         where = settings.get("set", read)
         if where is None:
             raise InputError("needs 'set', the Measurement Set to write, where there is no [data]")
-        fresh = read is None or Path(where).absolute() != Path(read).absolute()
+        fresh = read is None or os.path.realpath(where) != os.path.realpath(read)
+        if not fresh and not has_columns(str(read)):
+            raise InputError(f"{read} has no columns to write: give 'set', a new file, {ENDINGS}")
         usual = "DATA" if fresh else {"model": "MODEL_DATA"}.get(str(settings.get("what")), "CORRECTED_DATA")
         found = cls(**{"column": usual, **settings, "set": str(where), "fresh": fresh})
         if fresh and found.column != "DATA":
@@ -67,17 +71,22 @@ class Into(Stage):
         """Not where a prediction is written."""
         return self.what != "model"
 
+    @property
+    def named(self) -> str:
+        """The file, or the column and its set."""
+        return self.set if self.fresh else f"column {self.column} of {self.set}"
+
     def check(self, scene: Scene) -> None:
         """Refuse what is there already, before anything is computed."""
         if self.fresh:
-            MeasurementSet.free(self.set, self.overwrite)
+            demand_free(self.set, self.overwrite)
         else:
             MeasurementSet.free_column(self.set, self.column, self.overwrite)
 
     def work(self, run: Running) -> StageWork:
         """A file beside the set, and the set."""
         return StageWork(
-            f"{WHAT[self.what]} into {self.column} of {self.set}",
+            f"{WHAT[self.what]} into {self.named}",
             seconds=KEEPING * run.visibilities,
             finish_seconds=WRITING * run.visibilities,
             block_bytes=2 * 64.0 * float(np.prod(run.block)),
@@ -152,12 +161,13 @@ class _IntoRun(StageRun):
         self.writer.finish()
         stage, kept = self.stage, VisibilityFile(self.kept)
         if stage.fresh:
-            MeasurementSet.create(stage.set, kept, stage.overwrite, self.run.instrument)
+            write(stage.set, kept, stage.overwrite, self.run.instrument)
         else:
             assert isinstance(self.run.source, Seen)
+            assert isinstance(self.run.source.source, MeasurementSet)
             self.run.source.source.write(stage.column, kept, stage.overwrite)
         self.beside.cleanup()
-        finished.append(f"column {stage.column} of {stage.set} is written")
+        finished.append(f"{stage.named} is written")
         times, channels, _ = kept.store.shape
         return IntoResult(stage, 0.0 if stage.fresh else self.flagged / (times * channels))
 
@@ -165,7 +175,7 @@ class _IntoRun(StageRun):
 class IntoResult(StageResult):
     """Where it was written."""
 
-    def __init__(self, stage: Component, flagged: float) -> None:
+    def __init__(self, stage: Into, flagged: float) -> None:
         self.stage, self.flagged = stage, flagged
 
     def record(self) -> dict[str, Any]:
@@ -174,6 +184,6 @@ class IntoResult(StageResult):
 
     def lines(self) -> list[str]:
         """The same in words."""
-        stage: Any = self.stage
+        stage = self.stage
         said = f"; {100 * self.flagged:.3g} % flagged here: FLAG is as it was" if self.flagged else ""
-        return [f"into          {WHAT[stage.what]}: column {stage.column} of {stage.set}{said}"]
+        return [f"into          {WHAT[stage.what]}: {stage.named}{said}"]
