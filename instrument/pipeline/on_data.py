@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from instrument.errors import InputError
-from instrument.files.formats import ENDINGS, has_columns, names_file
 
 OWN = ("name", "title", "seed", "tolerance", "engine", "instrument", "sky")
 STAGES = {"predict": (), "calibrate": ("calibrate",), "image": ("correct", "image", "analyze"), "subtract": ()}
@@ -27,6 +26,8 @@ def tables_on(verb: str, tables: dict[str, Any], data: dict[str, Any], into: str
 
     Raises `InputError` where the scene lacks the table that the verb is about, and where neither is to be had.
     """
+    from instrument.files.formats import ENDINGS, has_columns, names_file
+
     if verb in STAGES[verb] and verb not in tables:
         raise InputError(f"{verb} takes its settings from a table [{verb}], which the scene has not")
     kept = {name: value for name, value in tables.items() if name in (*OWN, *STAGES[verb])}
