@@ -11,7 +11,7 @@ import numpy as np
 
 from instrument.doctor_checks import BEAM_AGREES, coexistence, extras, known_beams
 from instrument.machine import kept_in, measured_and_kept
-from instrument.pipeline.folder import leftovers
+from instrument.partial_folders import leftovers
 from instrument.pipeline.record import package_version
 
 NEEDED = (

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from instrument.errors import FileError, InputError
+from instrument.partial_folders import own_folder
 from instrument.provenance import written_by
 
 
@@ -26,19 +25,15 @@ def whole_file(path: str | os.PathLike[str], overwrite: bool = False) -> Iterato
     (full disk, no permission, no such folder) is a `FileError`.
     """
     target = Path(path)
-    private: Path | None = None
     free_file(target, overwrite)
     try:
-        private = Path(tempfile.mkdtemp(prefix=".partial-", dir=target.parent))
-        yield private / target.name
-        free_file(target, overwrite)  # it may have come meanwhile
-        (private / target.name).replace(target)
+        with own_folder(target) as private:
+            yield private / target.name
+            free_file(target, overwrite)  # it may have come meanwhile
+            (private / target.name).replace(target)
     except OSError as error:
         why = error.strerror or str(error).partition("\n")[0] or type(error).__name__
         raise FileError(f"{path} cannot be written: {why}") from None
-    finally:
-        if private is not None:
-            shutil.rmtree(private, ignore_errors=True)
 
 
 @contextmanager
@@ -48,27 +43,23 @@ def whole_folder(path: str | os.PathLike[str], mark: str, overwrite: bool = Fals
     The old one is there until the new one is whole.
     """
     target = Path(path)
-    private: Path | None = None
     free_folder(target, mark, overwrite)
     try:
-        private = Path(tempfile.mkdtemp(prefix=".partial-", dir=target.parent))
-        yield private / target.name
-        free_folder(target, mark, overwrite)
-        if target.is_dir():
-            old = target.rename(private / "old")
-            try:
+        with own_folder(target) as private:
+            yield private / target.name
+            free_folder(target, mark, overwrite)
+            if target.is_dir():
+                old = target.rename(private / "old")
+                try:
+                    (private / target.name).rename(target)
+                except OSError:
+                    old.rename(target)
+                    raise
+            else:
                 (private / target.name).rename(target)
-            except OSError:
-                old.rename(target)
-                raise
-        else:
-            (private / target.name).rename(target)
     except OSError as error:
         why = error.strerror or str(error).partition("\n")[0] or type(error).__name__
         raise FileError(f"{path} cannot be written: {why}") from None
-    finally:
-        if private is not None:
-            shutil.rmtree(private, ignore_errors=True)
 
 
 def free_folder(target: Path, mark: str, overwrite: bool) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Self
@@ -15,9 +14,11 @@ from instrument.errors import FileError, InputError
 from instrument.files import ms_create
 from instrument.files.by_rows import SAME_S, Cells, RowFile, Where, coordinates, places
 from instrument.files.ms_frame import beam_state_of, beam_words, frame_of
-from instrument.files.ms_rows import add_column, at_rows, filled, kinds_of, put_rows, rows_of
+from instrument.files.ms_rows import at_rows, filled, kinds_of, rows_of
 from instrument.files.ms_tables import demand, opened, told
+from instrument.files.ms_write import Part, add_column, correlated, demand_column, demand_space, put, undone
 from instrument.model import Instrument
+from instrument.partial_folders import beside
 from instrument.store import Store
 from instrument.units import Int
 from instrument.visibilities import Visibilities, VisibilitySet
@@ -63,35 +64,36 @@ class MeasurementSet(RowFile):
         return f", {self.column}"
 
     @checked
-    def write(self, column: str, blocks: VisibilitySet | Iterable[Visibilities], overwrite: bool = False) -> None:
+    def write(self, column: str, blocks: VisibilitySet | Iterable[Visibilities], overwrite: bool = False) -> int:
         """Write visibilities of the same times, channels and stations into a column, which is made if it is not there.
 
-        The blocks are worked out and kept beside the set first: where that fails, the set is as it was. A column that
-        is there is written with `overwrite` only. Rows that no block has, of autocorrelations and of other windows and
-        fields, stay as they are, zero in a new column. Data are written, with the keywords of LOFAR on which beam has
-        been taken out; weights and flags are not. Raises `InputError` for blocks that are of something else.
+        The blocks are worked out and kept beside the set first; where that fails, or the writing, or where it is
+        stopped, the set is as it was. A column that is there is written with `overwrite` only. Rows that no block has,
+        of autocorrelations and of other windows and fields, stay as they are, zero in a new column. Data are written,
+        with the keywords of LOFAR on which beam has been taken out; weights and flags are not: what is flagged and not
+        in the FLAG of the set is NaN, what is flagged in both stays as it was in a column that was there. The number
+        of correlations that are NaN for it. Raises `InputError` for blocks that are of something else, and for what is
+        no column for visibilities; `RefusedError` where the disk has no room.
         """
-        self.free_column(self.path, column, overwrite)
-        place = Path(self.path).absolute().parent
-        with tempfile.TemporaryDirectory(dir=place, prefix=f".{Path(self.path).name}.") as folder:
-            kept = _kept(blocks, Path(folder))
+        self.demand_column(column, overwrite)
+        demand_space(self.path, float(np.prod(self.shape)), kept=not isinstance(blocks, VisibilityFile))
+        lacking = 0
+        with beside(Path(self.path).absolute()) as folder:
+            kept = _kept(blocks, folder)
             self._same(kept.store)
-            with opened(self.path, writable=True) as table:
-                if column not in table.columns():
-                    add_column(table, column, self.column)
+            with undone(self.path, column, folder) as journal, opened(self.path, writable=True) as table:
+                there = column in table.columns()
+                if not there:
+                    add_column(table, column, self.column, self.path)
                 for block in kept.blocks():
-                    self._put(table, column, block)
+                    lacking += put(table, column, self._placed(table, block), there, journal)
                 with told(f"column {column}"):
                     table.putcolkeywords(column, beam_words(kept.store.beam_state))
+        return lacking
 
-    @staticmethod
-    def free_column(path: str, column: str, overwrite: bool) -> None:
+    def demand_column(self, column: str, overwrite: bool) -> None:
         """Raise `InputError` for a column that may not be written, or is there without `overwrite`."""
-        with opened(path) as table:
-            if column in table.columns() and not overwrite:
-                raise InputError(f"{path} has a column {column}: name another one, or allow to overwrite it (--force)")
-        if column in NEEDED or column in ("TIME_CENTROID", "EXPOSURE", "WEIGHT", "SIGMA", "WEIGHT_SPECTRUM"):
-            raise InputError(f"{column} is no column for visibilities")
+        demand_column(self.path, column, overwrite, self.frame)
 
     @classmethod
     def create(
@@ -173,22 +175,21 @@ class MeasurementSet(RowFile):
         if kept.shape[1] != self.shape[1] or np.abs(kept.freq_hz - self.freq_hz).max() > 1.0:
             raise InputError(f"the visibilities are of other channels than {self.path}")
 
-    def _put(self, table: Any, name: str, block: Visibilities) -> None:
-        """Write a block, where its times and channels are."""
+    def _placed(self, table: Any, block: Visibilities) -> Part:
+        """A block in the rows and correlations of the file, and where its times and channels are."""
         rows, frame = self.rows, self.frame
         times, channels = self._where(block)
         numbers = rows.of(times)
         one, two = (at_rows(table, station, numbers) for station in ("ANTENNA1", "ANTENNA2"))
         place = places(self.path, rows, len(frame.layout), times, one, two)
-        data = np.moveaxis(block.data, 1, 2).reshape(-1, len(block.freq_hz), 2, 2)[place]
-        turned = one > two
-        data[turned] = np.conj(np.swapaxes(data[turned], -1, -2))
-        if len(block.freq_hz) < len(frame.freq_hz):
-            whole = frame.linear(self._cube(table, name, numbers))
-            whole[:, channels] = data
-            data = whole
-        values = frame.correlated(data)
-        put_rows(table, name, numbers, values[:, ::-1] if frame.backwards else values)
+
+        def in_rows(x: Any) -> Any:
+            wide = np.broadcast_to(x if x.ndim == block.data.ndim else x[..., None, None], block.data.shape)
+            return np.moveaxis(wide, 1, 2).reshape(-1, len(block.freq_hz), 2, 2)[place]
+
+        data, flag = in_rows(block.data), in_rows(block.flag)
+        values, flags = correlated(frame, data, flag, one > two)
+        return Part(values, flags, numbers, frame.inside(channels, len(frame.freq_hz)))
 
 
 def _kept(blocks: VisibilitySet | Iterable[Visibilities], folder: Path) -> VisibilityFile:

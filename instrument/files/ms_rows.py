@@ -14,7 +14,6 @@ from instrument.files.ms_tables import column, told
 from instrument.units import Complex, Int
 
 AT_ONCE = 100_000  # rows of what tells where the rows are
-BLOCK_ROWS = 10_000  # of a new column that are written at once
 
 
 def parts(table: Any, *names: str) -> Iterator[tuple[int, list[Any]]]:
@@ -73,15 +72,3 @@ def put_rows(table: Any, name: str, numbers: Int, values: Complex) -> None:
     kind = np.complex128 if str(table.getcoldesc(name)["valueType"]).lower().startswith("d") else np.complex64
     with told(f"column {name}"):
         table.putcol(name, np.ascontiguousarray(values, kind), (np.asarray(numbers),))
-
-
-def add_column(table: Any, name: str, like: str) -> None:
-    """A new column of the shape of another, zero."""
-    described = dict(table.getcoldesc(like))
-    described.update({"dataManagerGroup": f"Tiled{name}", "comment": "visibilities", "keywords": {}})
-    described["dataManagerType"] = "TiledShapeStMan" if "shape" not in described else "TiledColumnStMan"
-    with told(f"column {name}"):
-        table.addcols({name: described}, {})
-        for r in range(0, table.nrow(), BLOCK_ROWS):  # or it holds what the disk held
-            rows = slice(r, min(r + BLOCK_ROWS, table.nrow()))
-            table.putcol(name, np.zeros_like(column(table, like, rows)), (rows,))

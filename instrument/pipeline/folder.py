@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import itertools
 import json
 import os
 import shutil
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from instrument.errors import InputError, warn
+from instrument.partial_folders import clean, locked_folder
 from instrument.terminal import finished
 
 MOST_BYTES = 200e6  # of a record
-PARTIAL = ".instrument-partial"  # ends the names of folders that are being written
 OURS = ("run.json", "compare.json", "precision.ecsv")  # files that only a folder written here holds
 TAKEN = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)  # what moving a folder onto something else answers
 
@@ -47,12 +45,8 @@ class RunFolder:
             for removed in clean(self.path.parent):
                 warn(removed)
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            short = self.path.name.encode()[:100].decode(errors="ignore")
-            fresh = Path(tempfile.mkdtemp(prefix=f".{short}.", dir=self.path.parent))
-            fresh.chmod(0o755)
-            # locked before it has the name of a partial folder: to the next run an unlocked one is a dead run's
-            self._lock = _locked(fresh)
-            self.partial = fresh.rename(fresh.with_name(fresh.name + PARTIAL))
+            self.partial, self._lock = locked_folder(self.path)
+            self.partial.chmod(0o755)
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
@@ -168,50 +162,6 @@ def _record(file: Path) -> Any:
     if not first.startswith("# %ECSV"):
         return {}
     return {line.lstrip("# -").partition(":")[0] for line in lines if line.startswith("#")}
-
-
-def clean(folder: Path) -> list[str]:
-    """Remove partial folders of runs that are dead; a line for each that was found and is not in use."""
-    said = []
-    for path in leftovers(folder):
-        lock = _locked(path)
-        shutil.rmtree(path, ignore_errors=True)
-        if lock is not None:
-            os.close(lock)
-        state = "could not be removed" if path.exists() else "removed"
-        said.append(f"{path}, left by a run that was killed, {state}")
-    return said
-
-
-def leftovers(folder: Path) -> list[Path]:
-    """Partial folders in a folder that no running process holds."""
-    try:
-        names = sorted(os.listdir(folder))
-    except OSError:
-        return []
-    found = []
-    for path in (Path(folder) / name for name in names if name.startswith(".") and name.endswith(PARTIAL)):
-        if path.is_symlink() or not path.is_dir():
-            continue
-        lock = _locked(path)
-        if lock is not None:
-            found.append(path)
-            os.close(lock)
-    return found
-
-
-def _locked(folder: Path) -> int | None:
-    """A descriptor that holds a folder until it is closed or its process dies; `None` where another holds it."""
-    try:
-        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-    except OSError:
-        return None
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:  # held, or a file system without locks: nothing is removed there
-        os.close(descriptor)
-        return None
-    return descriptor
 
 
 def _next_free(path: Path) -> Path:

@@ -7,8 +7,9 @@ import sys
 import pytest
 
 from instrument.errors import InputError, InstrumentWarning
+from instrument.partial_folders import PARTIAL, leftovers
 from instrument.pipeline import folder as run_folder
-from instrument.pipeline.folder import PARTIAL, RunFolder, leftovers
+from instrument.pipeline.folder import RunFolder
 
 
 @pytest.fixture(autouse=True)

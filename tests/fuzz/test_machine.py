@@ -16,7 +16,7 @@ from fuzzing import seeds
 from fuzzing.harness import Case, _whole
 from fuzzing.settings import written
 
-from instrument.pipeline.folder import PARTIAL
+from instrument.partial_folders import PARTIAL
 
 RUN = ("run", "s.toml", "--out", "o")
 SCENE = seeds.IMAGES

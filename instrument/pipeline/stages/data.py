@@ -203,7 +203,13 @@ class Seen(VisibilitySet):
         data = np.zeros((*shape[:2], baselines, 2, 2), complex)
         mine = np.where(self.turned[:, None, None], np.conj(np.swapaxes(block.data, -1, -2)), block.data)
         data[:, :, self.place[self.there]] = mine[:, :, self.there]
+        axes = block.flag.shape[3:]
+        flag = np.ones((*shape[:2], baselines, *axes), bool)
+        wide = np.broadcast_to(block.flag, (*shape[:3], *axes))
+        if axes:
+            wide = np.where(self.turned[:, None, None], np.swapaxes(wide, -1, -2), wide)
+        flag[:, :, self.place[self.there]] = wide[:, :, self.there]
         return Visibilities(
             data, source.sampling(block), source.rows.antenna1, source.rows.antenna2, block.interval_s, block.width_hz,
-            beam_state=block.beam_state,
+            flag=flag, beam_state=block.beam_state,
         )  # fmt: skip

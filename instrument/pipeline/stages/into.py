@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import os
-import tempfile
+import weakref
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 
-from instrument.errors import InputError
+from instrument.errors import InputError, RefusedError
 from instrument.files.formats import ENDINGS, demand_free, has_columns, write
 from instrument.files.measurement_set import MeasurementSet
+from instrument.files.ms_write import demand_column, demand_space
+from instrument.partial_folders import beside
 from instrument.pipeline.stage import Beside, Running, Stage, StageResult, StageRun
 from instrument.pipeline.stages.data import Seen
 from instrument.pipeline.work import Items, StageWork
@@ -81,7 +84,7 @@ class Into(Stage):
         if self.fresh:
             demand_free(self.set, self.overwrite)
         else:
-            MeasurementSet.free_column(self.set, self.column, self.overwrite)
+            demand_column(self.set, self.column, self.overwrite)
 
     def work(self, run: Running) -> StageWork:
         """A file beside the set, and the set."""
@@ -136,10 +139,14 @@ class _IntoRun(StageRun):
         place = Path(stage.set).absolute()
         if not place.parent.is_dir():
             raise InputError(f"[into] set = '{stage.set}': there is no folder {place.parent}")
-        self.beside = tempfile.TemporaryDirectory(dir=place.parent, prefix=f".{place.name}.")
-        self.kept = Path(self.beside.name) / "blocks.h5"
+        if not stage.fresh:
+            self._set.demand_column(stage.column, stage.overwrite)
+        demand_space(str(place), run.visibilities)
+        self.open = ExitStack()
+        weakref.finalize(self, self.open.close)  # also where the run is stopped
+        self.kept = self.open.enter_context(beside(place)) / "blocks.h5"
         self.writer: StoreWriter | None = None
-        self.flagged = 0.0
+        self.usable = False
 
     def take(self, block: Visibilities) -> Visibilities:
         """Keep it, or what was predicted, or the one less the other."""
@@ -151,8 +158,7 @@ class _IntoRun(StageRun):
             made = self.run.source.back(made)
         self.writer = self.writer or StoreWriter(self.kept, made)
         self.writer.add(made)
-        flag = self.stage.what == "data" and block.flag
-        self.flagged += float(np.mean(flag)) * len(block.at.slots_s) * len(block.freq_hz)
+        self.usable = self.usable or not made.flag.all()
         return block
 
     def finish(self) -> StageResult:
@@ -160,30 +166,39 @@ class _IntoRun(StageRun):
         assert self.writer is not None
         self.writer.finish()
         stage, kept = self.stage, VisibilityFile(self.kept)
+        if not self.usable:
+            self.open.close()
+            raise RefusedError(f"every visibility is flagged, or has no solution: {stage.named} is not written")
+        lacking = 0
         if stage.fresh:
             write(stage.set, kept, stage.overwrite, self.run.instrument)
         else:
-            assert isinstance(self.run.source, Seen)
-            assert isinstance(self.run.source.source, MeasurementSet)
-            self.run.source.source.write(stage.column, kept, stage.overwrite)
-        self.beside.cleanup()
+            lacking = self._set.write(stage.column, kept, stage.overwrite)
+        self.open.close()
         finished.append(f"{stage.named} is written")
-        times, channels, _ = kept.store.shape
-        return IntoResult(stage, 0.0 if stage.fresh else self.flagged / (times * channels))
+        return IntoResult(stage, lacking / (4 * float(np.prod(kept.store.shape))))
+
+    @property
+    def _set(self) -> MeasurementSet:
+        """The set that has the column."""
+        assert isinstance(self.run.source, Seen)
+        assert isinstance(self.run.source.source, MeasurementSet)
+        return self.run.source.source
 
 
 class IntoResult(StageResult):
     """Where it was written."""
 
-    def __init__(self, stage: Into, flagged: float) -> None:
-        self.stage, self.flagged = stage, flagged
+    def __init__(self, stage: Into, lacking: float) -> None:
+        self.stage, self.lacking = stage, lacking
 
     def record(self) -> dict[str, Any]:
         """The set and column."""
-        return {"into": {name: getattr(self.stage, name) for name in ("set", "column", "what")}}
+        stage = {name: getattr(self.stage, name) for name in ("set", "column", "what")}
+        return {"into": stage | {"not_a_number": self.lacking}}
 
     def lines(self) -> list[str]:
         """The same in words."""
         stage = self.stage
-        said = f"; {100 * self.flagged:.3g} % flagged here: FLAG is as it was" if self.flagged else ""
+        said = f"; {100 * self.lacking:.3g} % has no data or no solution: NaN there" if self.lacking else ""
         return [f"into          {WHAT[stage.what]}: {stage.named}{said}"]
