@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from instrument.errors import InputError, warn
 from instrument.files.ms_frame import LINEAR, beam_words
 from instrument.files.ms_tables import created, opened, told
+from instrument.files.ms_write import demand_single
 from instrument.jones.station import Level, StationBeam
 from instrument.model import Instrument
 from instrument.observe.layout import Layout
@@ -44,26 +46,41 @@ def make(path: str, store: Store, instrument: Instrument | None) -> None:
 
 
 def put(path: str, block: Visibilities, store: Store) -> None:
-    """The rows of a block, which stand in order of time and then of the block's baselines."""
+    """The rows of a block, which stand in order of time and then of the block's baselines, antenna 1 before 2.
+
+    Channels are ascending. What is not finite is flagged. Raises `InputError` for data and weights that single
+    precision does not hold.
+    """
     shape, count = block.data.shape, len(block.antenna1)
     first = int(np.abs(store.slots_s - block.at.slots_s[0]).argmin())
-    channel = int(np.abs(store.freq_hz - block.freq_hz[0]).argmin())
-    channels = slice(channel, channel + shape[1])
+    order = np.argsort(block.freq_hz)
+    place = np.searchsorted(np.sort(store.freq_hz), block.freq_hz[order])
+    channels: Any = slice(int(place[0]), int(place[0]) + len(place)) if np.all(np.diff(place) == 1) else place
     rows = slice(first * count, (first + shape[0]) * count)
     n = rows.stop - rows.start
+    turned = block.antenna1 > block.antenna2
+    one, two = np.minimum(block.antenna1, block.antenna2), np.maximum(block.antenna1, block.antenna2)
 
-    def cube(values: Any, kind: Any) -> Any:
-        whole = np.broadcast_to(values if values.ndim == len(shape) else values[..., None, None], shape)
-        return np.ascontiguousarray(np.moveaxis(whole, 1, 2).reshape(n, shape[1], 4), kind)
+    def cube(values: Any, kind: Any, conjugate: bool = False) -> Any:
+        whole = np.array(np.broadcast_to(values if values.ndim == len(shape) else values[..., None, None], shape))
+        back = np.swapaxes(whole[:, :, turned], -1, -2)
+        whole[:, :, turned] = back.conj() if conjugate else back
+        flat = np.moveaxis(whole[:, order], 1, 2).reshape(n, shape[1], 4)
+        if kind is not bool:
+            demand_single(flat, "the visibilities" if conjugate else "their weights")
+        return np.ascontiguousarray(flat, kind)
 
     weight = cube(block.weight, np.float32)
+    if np.any((weight == 0) & (cube(block.weight, float) > 0)):
+        raise InputError("their weights: numbers below 1e-45 cannot be written in single precision: scale them")
     mean = weight.mean(axis=1)
     per_row: dict[str, Any] = {
         "TIME": np.repeat(block.at.slots_s, count),
         "INTERVAL": np.repeat(np.broadcast_to(block.interval_s, shape[:1]), count),
-        "ANTENNA1": np.tile(block.antenna1, shape[0]).astype(np.int32),
-        "ANTENNA2": np.tile(block.antenna2, shape[0]).astype(np.int32),
-        "UVW": -block.uvw_m.reshape(-1, 3),  # antenna 2 minus antenna 1
+        "ANTENNA1": np.tile(one, shape[0]).astype(np.int32),
+        "ANTENNA2": np.tile(two, shape[0]).astype(np.int32),
+        # antenna 2 minus antenna 1
+        "UVW": (np.where(turned[:, None], 1.0, -1.0) * block.uvw_m).reshape(-1, 3),
         "WEIGHT": mean,
         "SIGMA": np.where(mean > 0, 1 / np.sqrt(np.maximum(mean, NO_WEIGHT**-2)), NO_WEIGHT).astype(np.float32),
         "FLAG_ROW": np.zeros(n, bool),
@@ -72,12 +89,13 @@ def put(path: str, block: Visibilities, store: Store) -> None:
     zeros = ("ARRAY_ID", "DATA_DESC_ID", "FEED1", "FEED2", "FIELD_ID", "OBSERVATION_ID", "PROCESSOR_ID", "SCAN_NUMBER")
     per_row |= dict.fromkeys((*zeros, "STATE_ID"), np.zeros(n, np.int32))
     with opened(path, writable=True) as table, told(path):
-        if channel == 0:
+        if place[0] == 0:
             for name, values in per_row.items():
                 table.putcol(name, values, (rows,))
         where = (rows, channels, slice(None))
-        table.putcol("DATA", cube(block.data, np.complex64), where)
-        table.putcol("FLAG", cube(block.flag, bool), where)
+        data = cube(block.data, np.complex64, conjugate=True)
+        table.putcol("DATA", data, where)
+        table.putcol("FLAG", cube(block.flag, bool) | ~np.isfinite(data), where)
         table.putcol("WEIGHT_SPECTRUM", weight, where)
 
 
@@ -137,8 +155,10 @@ def _set_up(path: str, store: Store, telescope: str, pointings: Sequence[Any]) -
     """Field, channels, correlations, range of times, and by what the set was written."""
     centre = Direction(*map(float, store.small["centre"]))
     steered = store.small.get("steered", centre)
-    freq, slots = store.freq_hz, store.slots_s
-    width = np.array(np.broadcast_to(store.small.get("width_hz", _spacing(freq)), freq.shape), float)
+    order, slots = np.argsort(store.freq_hz), store.slots_s
+    freq = store.freq_hz[order]
+    known = store.small["width_hz"] if "width_hz" in store.small else _spacing(freq)
+    width = np.array(np.broadcast_to(known, freq.shape), float)[order]
     half = store.small["interval_s"][[0, -1]] / 2
     span = np.array([[slots[0] - half[0], slots[-1] + half[1]]])
     middle = np.array([slots.mean()])
@@ -177,7 +197,9 @@ def _set_up(path: str, store: Store, telescope: str, pointings: Sequence[Any]) -
 
 def _spacing(freq: Float) -> float:
     """Width of channels of which nothing is known but where they are: their distance."""
-    return float(np.diff(freq).min()) if len(freq) > 1 else 1e5
+    width = float(np.diff(freq).min()) if len(freq) > 1 else 1e5
+    warn(f"the width of channels is not known: CHAN_WIDTH is {width / 1e3:g} kHz (channel_width of the Observation)")
+    return width
 
 
 def fill(

@@ -80,14 +80,15 @@ class Part(NamedTuple):
 
 def correlated(frame: Frame, data: Complex, flag: Bool, turned: Bool) -> tuple[Complex, Bool]:
     """Matrices of rows (N, F, 2, 2), and flags of them, as the correlations of the file; `turned` rows conjugated."""
-    data, flag = np.array(data), np.array(np.broadcast_to(flag, data.shape))
+    data, flag = np.array(data), np.array(np.broadcast_to(flag, data.shape), bool)
     data[turned] = np.conj(np.swapaxes(data[turned], -1, -2))
     flag[turned] = np.swapaxes(flag[turned], -1, -2)
+    each: Any
     if frame.kinds[0] in CIRCULAR:
-        each = np.broadcast_to(flag.any(axis=(-1, -2))[..., None], (*flag.shape[:2], len(frame.kinds)))
+        each = np.broadcast_to(np.asarray(flag.any(axis=(-1, -2)))[..., None], (*flag.shape[:2], len(frame.kinds)))
     else:
         each = flag.reshape(*flag.shape[:2], 4)[..., [LINEAR.index(kind) for kind in frame.kinds]]
-    values = frame.correlated(data)
+    values: Any = frame.correlated(data)
     return (values[:, ::-1], each[:, ::-1]) if frame.backwards else (values, each)
 
 
@@ -98,10 +99,11 @@ def put(table: Any, name: str, part: Part, there: bool, journal: Callable[[Int, 
     column is `there`. Raises `InputError` for values that single precision does not hold.
     """
     inside = (slice(None), part.channels)
-    flags = at_rows(table, "FLAG", part.rows).astype(bool)
+    flags: Any = at_rows(table, "FLAG", part.rows).astype(bool)
     if "FLAG_ROW" in table.columns():
-        flags = flags | at_rows(table, "FLAG_ROW", part.rows).astype(bool)[:, None, None]
-    flagged: Bool = np.asarray(flags)[inside]
+        alone: Any = at_rows(table, "FLAG_ROW", part.rows)
+        flags = flags | alone.astype(bool)[:, None, None]
+    flagged = flags[inside]
     try:
         whole = at_rows(table, name, part.rows)
         if there:

@@ -37,5 +37,5 @@ def tables_on(verb: str, tables: dict[str, Any], data: dict[str, Any], into: str
     what, usual = WRITES[verb]
     if into is None and not has_columns(data["set"]):
         raise InputError(f"{data['set']} has no columns to write: give --into a new file, {ENDINGS}")
-    named = {"set": into} if into is not None and names_file(into) else {"column": into or usual}
+    named = {"set": into} if into is not None and names_file(into) else {"column": usual if into is None else into}
     return out | {"into": {"what": what, **named, "overwrite": force}}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -139,7 +139,7 @@ def stream(
     elif run.modelled or run.source is None:
         blocks = run.plan.blocks(progress=passed)
     else:
-        blocks = run.source.blocks()
+        blocks = _counted(run.source.blocks(), len(run.plan.slices), passed)
     end = object()
     while True:
         with at_work(source):
@@ -157,6 +157,13 @@ def stream(
             give_back()  # what the blocks took, up to 300 MB, stays with the threads that are gone
             run.results[name] = one.finish()
         passing += share(name)
+
+
+def _counted(blocks: Iterator[Visibilities], count: int, passed: Callable[[float], None]) -> Iterator[Visibilities]:
+    """Blocks of data, with the fraction that is done."""
+    for k, block in enumerate(blocks, 1):
+        yield block
+        passed(k / count)
 
 
 @quick_give_back()

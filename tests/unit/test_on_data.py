@@ -220,3 +220,22 @@ def test_the_plan_says_how_far_the_sign_of_dp3_is(night, seen, capsys):
         == 0
     )
     assert "phase = 'fringe'" not in capsys.readouterr().out
+
+
+@pytest.mark.long
+def test_a_beam_that_was_taken_out_is_put_back_where_the_data_are_compared(night, tmp_path, capsys):
+    """Predicted with the beam, written corrected towards the centre: no other than the prediction is left of it."""
+    beam = ["--set", 'instrument.beam="full"']
+    scene = (night / "perfect.toml").read_text().replace(f'"{night}/perfect.MS"', f'"{tmp_path}/c.MS"')
+    (tmp_path / "c.toml").write_text(scene + "[correct]\n")
+    assert main(["run", str(tmp_path / "c.toml"), "--out", str(tmp_path / "run"), *beam]) == 0
+    assert MeasurementSet(tmp_path / "c.MS").beam_state.removed == "centre"
+    capsys.readouterr()
+    assert do("subtract", night, tmp_path / "c.MS", *beam) == 0
+    assert "put back, as the model has it" in capsys.readouterr().out
+    left, had = values(tmp_path / "c.MS", "SUBTRACTED_DATA"), values(tmp_path / "c.MS", "DATA")
+    assert np.abs(left).max() < 1e-6 * np.abs(had).max()
+    assert MeasurementSet(tmp_path / "c.MS", "SUBTRACTED_DATA").beam_state.removed == "nothing"
+    assert do("calibrate", night, tmp_path / "c.MS") == 2
+    said = capsys.readouterr().err
+    assert "the model has none: read a column that has it" in said and len(said.strip().splitlines()) == 1

@@ -10,13 +10,15 @@ from typing import Any
 import numpy as np
 
 from instrument import correlations
-from instrument.errors import InputError
+from instrument.errors import BeamStateError, InputError
 from instrument.files.by_rows import RowFile
 from instrument.files.formats import source
+from instrument.jones.towards import Towards
 from instrument.memory import give_back
 from instrument.observe.recorded import Recorded
 from instrument.pipeline.stage import Running, Stage, StageResult, StageRun
-from instrument.pipeline.work import StageWork
+from instrument.pipeline.work import Items, StageWork
+from instrument.plan import Item
 from instrument.scene import Scene
 from instrument.units import Bool, Int, SkyDirection
 from instrument.visibilities import Visibilities, VisibilitySet
@@ -86,10 +88,30 @@ class Data(Stage):
             block_bytes=run.block[0] * run.block[1] * (STORED * self.source.shape[2] + TAKEN * run.block[2]),
         )
 
+    def items(self, run: Running) -> Items:
+        """The beam that is put back into data from which it has been taken out; refuse what cannot be compared."""
+        state = self.source.beam_state
+        if not _compared(run) or state.removed == "nothing":
+            return Items()
+        remedy = "read a column that has it (column, --column)"
+        if state.other:
+            raise BeamStateError(
+                f"{self.source.named}: a part of the beam has been taken out, the model has it: {remedy}"
+            )
+        if not run.instrument.chain().beams().terms:
+            remedy += ", or give [instrument] its beam, which is put back"
+            raise BeamStateError(f"{self.source.named}: the beam has been taken out, the model has none: {remedy}")
+        return Items(kept=(Item("beam", f"was taken out towards {state.towards}: put back, as the model has it"),))
+
     def start(self, run: Running) -> StageRun:
         """The stage at work."""
         run.source = seen = Seen(self.source, run)
         return _DataRun(seen, run)
+
+
+def _compared(run: Running) -> bool:
+    """Whether a stage compares the data with a model."""
+    return any(stage.needs_sky and stage.reads for stage in run.stages.values())
 
 
 class _DataRun(StageRun):
@@ -141,6 +163,9 @@ class Seen(VisibilitySet):
         self.turned: Bool = one > two
         self.wanted = np.unique(self.place[self.there])
         self.straight = np.array_equal(self.place, self.wanted) and bool(self.there.all())
+        self.put_back = None  # the beam, where it has been taken out and the model has it
+        if _compared(run) and source.beam_state.removed != "nothing":
+            self.put_back = run.instrument.chain().beams()
         self.flagged = self.count = 0.0
 
     def blocks(self) -> Iterator[Visibilities]:
@@ -177,7 +202,10 @@ class Seen(VisibilitySet):
                 )
             weight[bad], flag[bad] = 0.0, True
         weight[:, :, ~self.there], flag[:, :, ~self.there] = 0.0, True
-        return replace(block, data=data, weight=weight, flag=flag, beam_state=found.beam_state)
+        made = replace(block, data=data, weight=weight, flag=flag, beam_state=found.beam_state)
+        if self.put_back is None:
+            return made
+        return made.corrupted(Towards(chain=self.put_back, direction=found.beam_state.towards))
 
     def _mine(self, values: Any) -> Any:
         """What was found of the baselines `wanted`, as those of the plan; 0 for those that are not there."""
