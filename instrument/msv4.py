@@ -25,6 +25,14 @@ def library() -> Any:
     return xarray
 
 
+def cells(values: Any, shape: tuple[int, ...]) -> Any:
+    """Values (T, F, B), or of correlations (T, F, B, 2, 2), as (T, B, F, 4); of one that is repeated, a view."""
+    wide = np.broadcast_to(values if values.ndim == 5 else values[..., None, None], shape)
+    if not any(wide.strides):
+        return np.broadcast_to(wide[:1, :1, :1, :1, 0].ravel(), (shape[0], shape[2], shape[1], 4))
+    return np.moveaxis(wide, 1, 2).reshape(shape[0], shape[2], shape[1], 4).copy()
+
+
 def tree_of(vis: Any) -> Any:
     """A measurement set of version 4: the main dataset, and in it those of antennas and of the field.
 
@@ -40,8 +48,7 @@ def tree_of(vis: Any) -> Any:
     names, shape = np.array(vis.layout.names), vis.data.shape
 
     def cube(values: Any) -> Any:
-        wide = np.broadcast_to(values if values.ndim == 5 else values[..., None, None], shape)
-        return np.moveaxis(wide, 1, 2).reshape(shape[0], shape[2], shape[1], 4).copy()
+        return cells(values, shape)
 
     interval = np.broadcast_to(vis.interval_s, shape[0])
     width, first = float(np.ravel(vis.width_hz)[0]), float(vis.freq_hz[0])

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from instrument.checked import checked
 from instrument.errors import InputError
@@ -35,6 +38,38 @@ def as_one(given: VisibilitySet | Iterable[Visibilities], beside: Path) -> Visib
         return given
     as_set(given).save(beside)
     return Visibilities.open(beside)
+
+
+def outline_and_blocks(
+    given: VisibilitySet | Iterable[Visibilities], beside: Path
+) -> tuple[Visibilities, Iterable[Visibilities]]:
+    """Coordinates of all there is, with data that take no memory, and the blocks, for a file that is filled by blocks.
+
+    Blocks are brought together in a file at `beside`, a name that is free and stays; what is one block is held anyway.
+    """
+    if isinstance(given, Visibilities):
+        first, shape, freq, width = given, given.data.shape, given.freq_hz, given.width_hz
+    else:
+        if not isinstance(given, VisibilityFile):
+            as_set(given).save(beside)
+            given = VisibilityFile(beside)
+        store = given.store
+        first, shape = Visibilities.of(store, slice(None), slice(0, 1)), (*store.shape, 2, 2)
+        freq, width = store.freq_hz, store.small.get("width_hz")
+    outline = replace(
+        first, data=np.broadcast_to(np.zeros((), complex), shape), at=replace(first.at, freq_hz=freq), width_hz=width,
+        weight=np.ones((1, 1, 1)), flag=np.zeros((1, 1, 1), bool),
+    )  # fmt: skip
+    return outline, given.blocks()
+
+
+def places_in(outline: Visibilities, block: Visibilities) -> tuple[slice, slice]:
+    """Where the times and channels of a block are among those of the whole."""
+    found = []
+    for all_of, some in ((outline.at.slots_s, block.at.slots_s), (outline.freq_hz, block.freq_hz)):
+        first = int(np.abs(all_of - some[0]).argmin())
+        found.append(slice(first, first + len(some)))
+    return found[0], found[1]
 
 
 REMEDY = "these blocks can be gone through once: give the plan itself, a list of blocks, or a file of them"

@@ -98,8 +98,9 @@ def main():
 `python docs/reports/large_set.py --gb {given.gb:g} --memory {given.memory}`
 
 {rows} rows of {CHANNELS} channels, {size / 1e9:.2f} GB: read, corrected for the beam and imaged (256 pixels, {CHANNELS}
-channels) with at most {given.memory}: {memory["planned_bytes"] / 1e9:.2f} GB planned, {memory["measured_bytes"] / 1e9:.2f} GB
-taken. {seconds:.0f} s, {part["image"]:.0%} of them gridding, {part["data"]:.0%} reading.
+channels) with at most {given.memory}: {memory["planned_bytes"] / 1e9:.2f} GB planned,
+{memory["measured_bytes"] / 1e9:.2f} GB taken.
+{seconds:.0f} s, {part["image"]:.0%} of them gridding, {part["data"]:.0%} reading.
 """
     (Path(__file__).parent / "large_set.md").write_text(text)
     print(text)

@@ -241,13 +241,13 @@ def block_of(
     among = np.full(every, -1)
     among[chosen] = np.arange(len(chosen))
     use = np.flatnonzero(among[where.place % every] >= 0)
-    alike = [frame.alike(values) for values in cells]
+    step = max(1, CELLS // max(len(frame.freq_hz), 1))
     shape = (times.stop - times.start, len(frame.freq_hz), len(chosen))
     data = np.zeros((*shape, 2, 2), complex)
     flag, weight = (
-        np.full(shape if same else data.shape, lacking) for same, lacking in zip(alike[1:], (True, 0.0), strict=True)
+        np.full(shape if frame.alike(values, step) else data.shape, lacking)
+        for values, lacking in ((cells.flag, True), (cells.weight, 0.0))
     )
-    step = max(1, CELLS // max(shape[1], 1))
     for first in range(0, len(use), step):
         some = use[first : first + step]
         to = where.place[some] // every, slice(None), among[where.place[some] % every]

@@ -70,12 +70,13 @@ class Frame:
             out[..., LINEAR.index(kind)] = values[..., k]
         return out.reshape(*values.shape[:-1], 2, 2)
 
-    def alike(self, values: Any) -> bool:
-        """Whether flags or weights (..., n) of the file are one for all four receptors."""
+    def alike(self, values: Any, step: int) -> bool:
+        """Whether flags or weights (N, F, n) of the file are one for all four receptors, looked at in `step` rows."""
         if self.kinds[0] in CIRCULAR:
             return True
-        return len(self.kinds) == 4 and np.array_equal(
-            values[..., 1:], values[..., :-1], equal_nan=values.dtype != bool
+        return len(self.kinds) == 4 and all(
+            np.array_equal(some[..., 1:], some[..., :-1], equal_nan=some.dtype != bool)
+            for some in (values[r : r + step] for r in range(0, len(values), step))
         )
 
     def correlated(self, data: Complex) -> Complex:

@@ -16,17 +16,18 @@ from instrument.errors import FileError, InputError
 from instrument.files.by_rows import Cells, RowFile, Rows, Where, coordinates, in_time, pairs_of
 from instrument.files.ms_frame import EQUATORIAL, NAMES, Frame, beam_state_of, beam_words, correlated, distinct
 from instrument.files_in import harmless
-from instrument.memory import afford
-from instrument.msv4 import ANTENNAS, UNIX_S, library, tree_of
+from instrument.msv4 import ANTENNAS, UNIX_S, cells, library, tree_of
 from instrument.observe.layout import Layout
 from instrument.store import FORMAT
 from instrument.units import Direction, Float, Int
 from instrument.visibilities import Visibilities, VisibilitySet
-from instrument.visibility_sets import as_one
+from instrument.visibility_sets import outline_and_blocks, places_in
 from instrument.whole_file import whole_folder
 
 KINDS = {name: kind for kind, name in NAMES.items()}
 MARK = ".zgroup"  # of version 2 of Zarr, which has names of stations; in version 3 they have no place of their own yet
+CUBES = ("VISIBILITY", "FLAG", "WEIGHT")
+CHUNK_BYTES = 8e6  # of data that Zarr reads at once
 BEAM = "instrument_beam"  # attribute of a main dataset: what has been taken out
 
 
@@ -55,14 +56,21 @@ def write_msv4(
         raise InputError(f"{path}: the name of a set of version 4 is to end in {zarr_tree.SUFFIX}")
     xarray, zarr = library(), zarr_tree.library()
     with whole_folder(path, MARK, overwrite) as partial:
-        vis = as_one(visibilities, partial.parent / "blocks.h5")
-        afford(3 * vis.data.nbytes, f"{path}: all of it at once", "write fewer channels or times in a file")
-        tree = tree_of(vis)
-        tree.attrs[BEAM] = beam_words(vis.beam_state)
+        outline, blocks = outline_and_blocks(visibilities, partial.parent / "blocks.h5")
+        tree = tree_of(outline)
+        tree.attrs[BEAM] = beam_words(outline.beam_state)
         root = xarray.DataTree.from_dict({"/": xarray.Dataset(attrs={"type": "processing_set"})})
         root["set"] = tree
+        times, channels, baselines = outline.data.shape[:3]
+        chunk = (int(max(1, min(times, CHUNK_BYTES // (64 * channels * baselines)))), baselines, channels, 4)
+        chunks = {"/set": {name: {"chunks": chunk} for name in CUBES}}
         with _told(path), zarr.config.set({"array.write_empty_chunks": True}):  # or -0.0 comes back as 0.0
-            root.to_zarr(partial, mode="w-", consolidated=True, zarr_format=2)
+            root.to_zarr(partial, mode="w-", consolidated=True, zarr_format=2, encoding=chunks)
+            group = zarr.open_group(str(partial), mode="r+", zarr_format=2)["set"]
+            for block in blocks:
+                t, f = places_in(outline, block)
+                for name, values in zip(CUBES, (block.data, block.flag, block.weight), strict=True):
+                    group[name][t, :, f] = cells(values, block.data.shape)
 
 
 @checked

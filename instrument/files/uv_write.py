@@ -17,11 +17,12 @@ from instrument.files.uv_file import JD_OF_MJD, MEAN
 from instrument.memory import afford
 from instrument.provenance import written_by
 from instrument.visibilities import Visibilities, VisibilitySet
-from instrument.visibility_sets import as_one
+from instrument.visibility_sets import as_one, outline_and_blocks, places_in
 from instrument.whole_file import whole_file
 
 LINEAR = (-5, -6, -7, -8)  # xx, yy, xy, yx, as AIPS numbers them
 PLACES = [0, 3, 1, 2]  # of these among pp, pq, qp, qq
+KINDS_OF = {"single": (np.complex64, np.float32), "double": (np.complex128, np.float64)}  # data; weights of UVFITS
 
 
 @checked
@@ -44,26 +45,28 @@ def write_uv(
     if kind is None:
         raise InputError(f"{path}: the name of the file is to end in one of {', '.join(KINDS)}")
     library()
+    precision = precision or ("double" if kind == "uvh5" else "single")
     with whole_file(path, overwrite) as partial:
+        if kind == "uvh5":
+            outline, blocks = outline_and_blocks(visibilities, partial.parent / "blocks.h5")
+            uv = _uv_data(path, outline, telescope)
+            with told(path):
+                uv.initialize_uvh5_file(str(partial), data_write_dtype=np.dtype(KINDS_OF[precision][0]))
+                for block in blocks:
+                    uv.write_uvh5_part(str(partial), check_header=False, **_part(outline, block, precision))
+            return
         vis = as_one(visibilities, partial.parent / "blocks.h5")
-        afford(4 * vis.data.nbytes, f"{path}: all of it at once", "write fewer channels or times in a file")
-        uv = _uv_data(path, vis, precision or ("double" if kind == "uvh5" else "single"), telescope)
+        afford(4 * vis.data.nbytes, f"{path}: all of it at once", "write fewer channels or times in a file, or UVH5")
+        uv = _uv_data(path, vis, telescope, _rows(vis, precision, KINDS_OF[precision][1]))
         with told(path):
-            (uv.write_uvh5 if kind == "uvh5" else uv.write_uvfits)(str(partial))
-            if kind == "uvfits":
-                name_antennas(partial, "AIPS AN", "ANNAME", vis.layout.names)
+            uv.write_uvfits(str(partial))
+            name_antennas(partial, "AIPS AN", "ANNAME", vis.layout.names)
 
 
-def _uv_data(path: Any, vis: Visibilities, precision: str, telescope: str) -> Any:
-    """What pyuvdata holds of visibilities: rows by time, then by baseline."""
-    if vis.width_hz is None:
-        raise InputError(
-            f"{path}: channels need a width, which is not known: give channel_width to the Observation, or "
-            "dataclasses.replace(vis, width_hz=...)"
-        )
+def _rows(vis: Visibilities, precision: str, weights: type) -> dict[str, Any]:
+    """Data, flags and weights in rows by time, then by baseline, of the correlations of pyuvdata."""
     times, channels, baselines = vis.data.shape[:3]
     turned = vis.antenna1 > vis.antenna2
-    first, second = np.minimum(vis.antenna1, vis.antenna2), np.maximum(vis.antenna1, vis.antenna2)
 
     def rows(values: Any, conjugate: bool = False) -> Any:
         wide = values if values.ndim == 5 else values[..., None, None]
@@ -73,17 +76,41 @@ def _uv_data(path: Any, vis: Visibilities, precision: str, telescope: str) -> An
         flat = wide.reshape(times, channels, baselines, 4)[..., PLACES]
         return np.ascontiguousarray(np.moveaxis(flat, 1, 2)).reshape(times * baselines, channels, 4)
 
-    double = precision == "double"
+    return {
+        "data_array": rows(vis.data, conjugate=True).astype(KINDS_OF[precision][0]),
+        "flag_array": rows(vis.flag),
+        "nsample_array": rows(vis.weight).astype(weights),
+    }
+
+
+def _part(outline: Visibilities, block: Visibilities, precision: str) -> dict[str, Any]:
+    """A block, and where its rows and channels are in the file."""
+    times, channels = places_in(outline, block)
+    count = len(outline.antenna1)
+    return _rows(block, precision, np.float32) | {
+        "blt_inds": np.arange(times.start * count, times.stop * count),
+        "freq_chans": np.arange(channels.start, channels.stop),
+    }
+
+
+def _uv_data(path: Any, vis: Visibilities, telescope: str, rows: dict[str, Any] | None = None) -> Any:
+    """What pyuvdata holds of visibilities: rows by time, then by baseline; without `rows` their coordinates alone."""
+    if vis.width_hz is None:
+        raise InputError(
+            f"{path}: channels need a width, which is not known: give channel_width to the Observation, or "
+            "dataclasses.replace(vis, width_hz=...)"
+        )
+    times, channels = vis.data.shape[:2]
+    turned = vis.antenna1 > vis.antenna2
+    first, second = np.minimum(vis.antenna1, vis.antenna2), np.maximum(vis.antenna1, vis.antenna2)
     with told(path):
         uv = library().UVData.new(
             freq_array=vis.freq_hz, polarization_array=np.array(LINEAR), times=JD_OF_MJD + vis.at.slots_s / 86400.0,
             telescope=telescope_of(vis.layout, telescope), antpairs=np.stack([first, second], 1) + 1, do_blt_outer=True,
             integration_time=np.array(np.broadcast_to(vis.interval_s, times)),
             channel_width=np.array(np.broadcast_to(vis.width_hz, channels)), update_telescope_from_known=False,
-            data_array=rows(vis.data, conjugate=True).astype(np.complex128 if double else np.complex64),
-            flag_array=rows(vis.flag), nsample_array=rows(vis.weight).astype(float if double else np.float32),
             history=f"{written_by()['software']}, {written_by()['written']}. ", vis_units="Jy", pol_convention=MEAN,
-            time_axis_faster_than_bls=False, extra_keywords=_beam(vis),
+            time_axis_faster_than_bls=False, extra_keywords=_beam(vis), **(rows or {}),
             phase_center_catalog={
                 0: {
                     "cat_name": "phase centre", "cat_type": "sidereal", "cat_frame": "icrs", "cat_epoch": 2000.0,
