@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 from instrument.checked import checked
 from instrument.errors import BeamStateError, warn
 from instrument.jones.chain import Chain
 from instrument.jones.towards import Towards
 from instrument.units import Direction
+
+Part = Literal["Full", "Element", "ArrayFactor"]  # of a station's beam, as LOFAR's programs name them
+PARTS: tuple[Part, ...] = get_args(Part)
 
 
 @checked
@@ -18,17 +21,19 @@ class BeamState:
     """What has been taken out of visibilities: "nothing" or "centre" (the beam), and towards where.
 
     `beams` is the part of the chain in the data that differs between directions; `None` where nobody knows it (data
-    from elsewhere). `other` says that it was another beam that has been taken out.
+    from elsewhere). `other` says that it was another beam that has been taken out, of which `part` is what others have.
     """
 
     removed: Literal["nothing", "centre"] = "nothing"
     towards: Direction | None = None
     beams: Chain | None = field(default=None, compare=False)
     other: bool = False
+    part: Part = "Full"
 
     def __str__(self) -> str:
         if self.removed == "centre":
             which = "another beam" if self.other else "differential beam"
+            which += f" ({self.part} only)" if self.part != "Full" else ""
             return f"{which}, removed towards {self.towards}"
         return "no beam" if self.beams is not None and not self.beams.terms else "absolute beam"
 

@@ -74,6 +74,7 @@ def _fixed(block: Any, texts: bool = True) -> dict[str, Any]:
         return out
     beams = None if state.beams is None else state.beams.to_dict()
     told = {"removed": state.removed, "towards": state.towards, "beams": beams, "other": state.other}
+    told |= {"part": state.part} if state.part != "Full" else {}  # as it was before parts were known
     spelled = {"layout": block.layout.to_json(), "beam_state": json.dumps(told)}
     return out | {name: np.frombuffer(text.encode(), np.uint8) for name, text in spelled.items()}
 
@@ -314,7 +315,7 @@ def _state(told: dict[str, Any], name: str, version: int) -> BeamState:
             beams = beams if version > 1 else Chain(*(_element_of_everybeam(term) for term in beams.terms))
         except InputError as error:
             warn(f"{name}: which beam is in the data is not known here: {harmless(h5.one_line(error), 200)}")
-    return BeamState(told["removed"], towards, beams, bool(told["other"]))
+    return BeamState(told["removed"], towards, beams, bool(told["other"]), told.get("part", "Full"))
 
 
 def _of_everybeam(told: Any) -> Any:

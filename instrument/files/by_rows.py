@@ -12,7 +12,8 @@ import numpy as np
 from instrument.beam_state import BeamState
 from instrument.errors import FileError, InputError, warn
 from instrument.files.ms_frame import Frame
-from instrument.observe.closure import stations_seen
+from instrument.files.ms_units import LATEST_S
+from instrument.observe.closure import CLOSURE_M, rounding_m, stations_seen
 from instrument.observe.directions import earth_frame
 from instrument.observe.recorded import Recorded
 from instrument.observe.sampling import Sampling, times_of
@@ -94,7 +95,7 @@ class RowFile(VisibilitySet):
     def observation(self) -> Recorded:
         """The observation that the file holds, for a `Scene` that is predicted with its times, channels and UVW.
 
-        Raises `InputError` where the UVW are not those of stations, or integrations are not equally long.
+        Raises `InputError` where the UVW are not those of stations, or integrations have no length; it has the longest.
         """
         return recorded(self.path, self.frame, self.rows, (self._coordinates(times) for times in self._steps()))
 
@@ -157,13 +158,19 @@ def pairs_of(one: Int, two: Int, stations: int, path: str) -> Int:
 
 def in_time(numbers: Int, time: Float, pairs: Int, stations: int, path: str) -> Rows:
     """Rows of cross-correlations, of these `pairs_of`, in order of time; `interval_s` still those of nothing."""
-    if not np.isfinite(time).all():
-        raise FileError(f"{path}: TIME is not finite")
+    if not np.all((time >= 0) & (time < LATEST_S)):
+        bad = time[~((time >= 0) & (time < LATEST_S))][0]
+        raise FileError(f"{path}: TIME is {bad:g} s: it is to be a date, seconds of MJD (5e9 in 2017)")
     if np.any(np.diff(time) < 0):
         order = np.argsort(time, kind="stable")
         numbers, time = numbers[order], time[order]
     begins = np.append(np.flatnonzero(np.diff(time, prepend=-np.inf) > SAME_S), len(time))
-    slots = time[begins[:-1]]
+    slots, each = time[begins[:-1]], float(np.median(np.diff(begins)))
+    if each < len(pairs) / 2:
+        warn(
+            f"{path}: half of its {len(slots)} times have at most {each:g} of {len(pairs)} baselines: where TIME "
+            "differs by more than 1 ms between baselines, times are apart that are one"
+        )
     return Rows(numbers, begins, slots, np.zeros(len(slots)), pairs // stations, pairs % stations, 0)
 
 
@@ -199,9 +206,14 @@ def coordinates(path: str, frame: Frame, rows: Rows, times: slice, one: Int, two
     seen.ravel()[place] = True
     if not times.start:
         _compare(path, own, ours)
-    stations = stations_seen(own, seen, rows.antenna1, rows.antenna2, at.uvw_m)
-    if stations is None:
-        return Where(at, own, place, turned)
+    stations, apart = stations_seen(own, seen, rows.antenna1, rows.antenna2, at.uvw_m)
+    if apart > CLOSURE_M:
+        if apart > rounding_m(uvw):
+            return Where(at, own, place, turned)
+        if not times.start:
+            warn(
+                f"{path}: UVW are rounded to single precision: they close around triangles of stations to {apart:.2g} m"
+            )
     return Where(replace(at, own_uvw_m=stations), None, place, turned)
 
 
@@ -274,16 +286,25 @@ def block_of(
 def recorded(path: str, frame: Frame, rows: Rows, parts: Iterable[Where]) -> Recorded:
     """The observation of a file, of the coordinates of all its times; raises `InputError` where it is none to predict.
 
-    That is where the UVW are not those of stations, or integrations are not equally long.
+    That is where the UVW are not those of stations, or integrations have no length.
     """
+    longest = float(rows.interval_s.max())
+    if not (np.all(rows.interval_s >= 0) and 0 < longest < np.inf):
+        raise InputError(f"{path}: INTERVAL is {rows.interval_s.min():g} to {longest:g} s: integrations need a length")
     if np.ptp(rows.interval_s) > SAME_S:
-        raise InputError(f"{path}: integrations of {rows.interval_s.min():g} to {rows.interval_s.max():g} s")
+        warn(
+            f"{path}: integrations of {rows.interval_s.min():g} to {longest:g} s: what is predicted is smeared as the "
+            "longest are"
+        )
     first, found, width = None, [], frame.width_hz
     for part in parts:
         if part.given_uvw_m is not None:
-            raise InputError(f"{path}: its UVW do not close around triangles of stations: nothing is predicted")
+            raise InputError(
+                f"{path}: its UVW do not close around triangles of stations, as scenes need it: write UVW of stations "
+                "(CASA's fixvis); in Python Imager.image takes the set as it is"
+            )
         first = first or part.at
         found.append(part.at.uvw_m)
     assert first is not None
     at = replace(first, slots_s=rows.slots_s, own_uvw_m=np.concatenate(found))
-    return Recorded.of(at, float(rows.interval_s[0]), float(width[0]) if np.ptp(width) == 0 else None)
+    return Recorded.of(at, longest, float(width[0]) if np.ptp(width) == 0 else None)

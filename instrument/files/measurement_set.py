@@ -14,8 +14,9 @@ from instrument.errors import FileError, InputError
 from instrument.files import ms_create
 from instrument.files.by_rows import SAME_S, Cells, RowFile, Where, coordinates, places
 from instrument.files.ms_frame import beam_state_of, beam_words, frame_of
-from instrument.files.ms_rows import at_rows, filled, kinds_of, rows_of
-from instrument.files.ms_tables import demand, opened, told
+from instrument.files.ms_rows import at_rows, filled, pairs_at, rows_of
+from instrument.files.ms_tables import demand, kinds_of, opened, told
+from instrument.files.ms_units import in_unit
 from instrument.files.ms_write import Part, add_column, correlated, demand_column, demand_space, put, undone
 from instrument.model import Instrument
 from instrument.partial_folders import beside
@@ -55,7 +56,9 @@ class MeasurementSet(RowFile):
             described, fields = (kinds_of(table, name) for name in ("DATA_DESC_ID", "FIELD_ID"))
             self.frame = frame_of(self.path, window, field, described, fields)
             self.rows = rows_of(table, self.frame, self.path)
-            self.weights = next((n for n in ("WEIGHT_SPECTRUM", "WEIGHT") if filled(table, n, self.rows)), "")
+            self.weights = next(
+                (n for n in ("WEIGHT_SPECTRUM", "WEIGHT") if filled(table, n, self.rows, self.path)), ""
+            )
             self.beam_state = beam_state_of(table.getcolkeywords(column), self.path)
         self._say_autos()
 
@@ -137,14 +140,13 @@ class MeasurementSet(RowFile):
 
     def _cube(self, table: Any, name: str, numbers: Int, channels: slice = slice(None)) -> Any:
         """Values (N, F, n) of a column, channels ascending."""
-        count = len(self.frame.freq_hz)
-        inside = self.frame.inside(channels, count)
+        inside = self.frame.inside(channels)
         have = inside.stop - inside.start
-        values = at_rows(table, name, numbers, None if have == count else inside)
+        values = at_rows(table, name, numbers, None if have == len(self.frame.freq_hz) else inside)
         want = (len(numbers), have, len(self.frame.kinds))
         if values.shape != want:
             raise FileError(f"{self.path}: {name} has shape {values.shape}, channels and correlations need {want}")
-        return values[:, ::-1] if self.frame.backwards else values
+        return self.frame.ascending(values, channels)
 
     def _weight(self, table: Any, numbers: Int, channels: slice) -> Any:
         shape = (len(numbers), len(self.frame.freq_hz[channels]), len(self.frame.kinds))
@@ -156,7 +158,8 @@ class MeasurementSet(RowFile):
     def _coordinates(self, times: slice) -> Where:
         numbers = self.rows.of(times)
         with opened(self.path) as table:
-            one, two, uvw = (at_rows(table, name, numbers) for name in ("ANTENNA1", "ANTENNA2", "UVW"))
+            one, two = pairs_at(table, self.frame, numbers)
+            uvw = in_unit(table, "UVW", at_rows(table, "UVW", numbers), "m", self.path)
         return coordinates(self.path, self.frame, self.rows, times, one, two, uvw)
 
     def _same(self, kept: Store) -> None:
@@ -180,7 +183,7 @@ class MeasurementSet(RowFile):
         rows, frame = self.rows, self.frame
         times, channels = self._where(block)
         numbers = rows.of(times)
-        one, two = (at_rows(table, station, numbers) for station in ("ANTENNA1", "ANTENNA2"))
+        one, two = pairs_at(table, frame, numbers)
         place = places(self.path, rows, len(frame.layout), times, one, two)
 
         def in_rows(x: Any) -> Any:
@@ -189,7 +192,7 @@ class MeasurementSet(RowFile):
 
         data, flag = in_rows(block.data), in_rows(block.flag)
         values, flags = correlated(frame, data, flag, one > two)
-        return Part(values, flags, numbers, frame.inside(channels, len(frame.freq_hz)))
+        return Part(values, flags, numbers, frame.order[channels])
 
 
 def _kept(blocks: VisibilitySet | Iterable[Visibilities], folder: Path) -> VisibilityFile:

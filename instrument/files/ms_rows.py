@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -10,31 +9,26 @@ import numpy as np
 from instrument.errors import FileError
 from instrument.files.by_rows import Rows, in_time, pairs_of
 from instrument.files.ms_frame import Frame
-from instrument.files.ms_tables import column, told
+from instrument.files.ms_tables import AT_ONCE, column, parts, told
+from instrument.files.ms_units import in_unit, utc
 from instrument.units import Complex, Int
 
-AT_ONCE = 100_000  # rows of what tells where the rows are
 
 
-def parts(table: Any, *names: str) -> Iterator[tuple[int, list[Any]]]:
-    """The number of the first row of a part of the table, and its values of columns of numbers."""
-    for r in range(0, table.nrow(), AT_ONCE):
-        yield r, [column(table, name, slice(r, r + AT_ONCE)) for name in names]
-
-
-def kinds_of(table: Any, name: str) -> Int:
-    """The values that a column of numbers has, each once."""
-    return np.unique(np.concatenate([np.unique(values) for _, (values,) in parts(table, name)]))
-
-
-def filled(table: Any, name: str, rows: Rows) -> bool:
-    """Whether a column of weights is there and has values."""
+def filled(table: Any, name: str, rows: Rows, path: str) -> bool:
+    """Whether a column of weights is there and has values; raises `FileError` where only some rows have them."""
     if name not in table.columns():
         return False
-    try:
-        return column(table, name, slice(int(rows.numbers[0]), int(rows.numbers[0]) + 1)).size > 0
-    except FileError:
-        return False  # declared, and empty
+    if "shape" in table.getcoldesc(name):
+        return True  # of every row
+    have, count = 0, len(rows.numbers)
+    for r in range(0, count, AT_ONCE):
+        with told(f"column {name}"):
+            shapes = table.row_shapes(name, (rows.numbers[r : r + AT_ONCE],))
+            have += len(shapes) - shapes.null_count
+    if 0 < have < count:
+        raise FileError(f"{path}: {name} has values in {have} of {count} rows: fill it, or remove the column")
+    return have > 0  # or declared, and empty
 
 
 def rows_of(table: Any, frame: Frame, path: str) -> Rows:
@@ -47,15 +41,16 @@ def rows_of(table: Any, frame: Frame, path: str) -> Rows:
         mine, cross = (described == frame.described) & (fields == frame.field), one != two
         autos += int((mine & ~cross).sum())
         here = np.flatnonzero(mine & cross)
+        one, two = frame.numbered(one), frame.numbered(two)
         numbers.append(r + here)
-        times.append(time[here])
+        times.append(in_unit(table, "TIME", time[here], "s", path))
         pairs.append(pairs_of(one[here], two[here], stations, path))
     whole = [np.concatenate(found) for found in (numbers, times, pairs)]
     if not len(whole[0]):
         raise FileError(f"{path} has no cross-correlations of this window and field")
     found = in_time(whole[0], whole[1], np.unique(whole[2]), stations, path)
-    interval = at_rows(table, "INTERVAL", found.numbers[found.begins[:-1]])
-    return found._replace(interval_s=interval, autos=autos)
+    interval = in_unit(table, "INTERVAL", at_rows(table, "INTERVAL", found.numbers[found.begins[:-1]]), "s", path)
+    return found._replace(slots_s=utc(table, found.slots_s, path), interval_s=interval, autos=autos)
 
 
 def at_rows(table: Any, name: str, numbers: Int, channels: slice | None = None) -> Any:
@@ -65,6 +60,12 @@ def at_rows(table: Any, name: str, numbers: Int, channels: slice | None = None) 
         where = slice(int(numbers[0]), int(numbers[-1]) + 1)
     with told(f"column {name}"):
         return np.asarray(table.getcol(name, (where,) if channels is None else (where, channels)))
+
+
+def pairs_at(table: Any, frame: Frame, numbers: Int) -> tuple[Int, Int]:
+    """The stations of some rows, as the layout numbers them."""
+    one, two = (frame.numbered(at_rows(table, name, numbers)) for name in ("ANTENNA1", "ANTENNA2"))
+    return one, two
 
 
 def put_rows(table: Any, name: str, numbers: Int, values: Complex) -> None:

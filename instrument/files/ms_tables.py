@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,8 +12,10 @@ from typing import Any
 import numpy as np
 
 from instrument.errors import FileError, InputError
+from instrument.files.ms_lock import unlocked
 from instrument.files_in import harmless
 
+AT_ONCE = 100_000  # rows of what tells where the rows are
 MISSING = "Measurement Sets need arcae (Linux, macOS): pip install 'instrument[ms]'"
 
 
@@ -25,12 +28,13 @@ def opened(path: str | os.PathLike[str], sub: str = "", writable: bool = False) 
         raise FileError(f"{name}: there is no such Measurement Set")
     if not (Path(name) / "table.dat").is_file():
         raise FileError(f"{name}: no Measurement Set: it is to be a folder with a file table.dat")
-    with told(f"{name}::{sub}" if sub else name):
-        table = Table.from_filename(f"{name}::{sub}" if sub else name, readonly=not writable)
-    try:
-        yield table
-    finally:
-        table.close()
+    with unlocked(f"{name}/{sub}" if sub else name, writable):
+        with told(f"{name}::{sub}" if sub else name):
+            table = Table.from_filename(f"{name}::{sub}" if sub else name, readonly=not writable)
+        try:
+            yield table
+        finally:
+            table.close()
 
 
 @contextmanager
@@ -72,9 +76,14 @@ def told(what: str) -> Iterator[None]:
     except InputError:
         raise
     except (ValueError, RuntimeError, KeyError, TypeError, OSError, NotImplementedError) as error:
-        text = " ".join(str(error).split())
-        if "Data Manager class" in text or "datamanager" in text.lower():
-            text += " (a storage manager that is not installed here: write the set without compression, DP3's msout)"
+        text = " ".join(str(error).split()).replace("Unhandled casacore exception: ", "")
+        lacking = re.search(r"Shared library (\S+) not found in CASACORE_LDPATH|Data Manager class (\S+)", text)
+        if lacking:
+            text = (
+                f"its storage manager {lacking[1] or lacking[2]} is not installed here: put the folder of its library "
+                "(DyscoStMan: libdyscostman) into CASACORE_LDPATH, or copy the set without it (DP3, with no "
+                "msout.storagemanager)"
+            )
         raise FileError(f"{harmless(what)}: {harmless(text, 300)}") from None
 
 
@@ -84,6 +93,17 @@ def column(table: Any, name: str, rows: slice | None = None) -> Any:
         if rows is None:
             return np.array(table.getcol(name))
         return np.array(table.getcol(name, (slice(rows.start, min(rows.stop, table.nrow())),)))
+
+
+def parts(table: Any, *names: str) -> Iterator[tuple[int, list[Any]]]:
+    """The number of the first row of a part of the table, and its values of columns of numbers."""
+    for r in range(0, table.nrow(), AT_ONCE):
+        yield r, [column(table, name, slice(r, r + AT_ONCE)) for name in names]
+
+
+def kinds_of(table: Any, name: str) -> Any:
+    """The values that a column of numbers has, each once."""
+    return np.unique(np.concatenate([np.unique(values) for _, (values,) in parts(table, name)]))
 
 
 def demand(table: Any, names: tuple[str, ...], what: str) -> None:

@@ -13,9 +13,9 @@ import numpy as np
 
 from instrument.errors import FileError, InputError, RefusedError
 from instrument.files.ms_frame import CIRCULAR, LINEAR, Frame
-from instrument.files.ms_rows import at_rows, parts, put_rows
+from instrument.files.ms_rows import at_rows, put_rows
 from instrument.files.ms_tables import column as values_of
-from instrument.files.ms_tables import opened, told
+from instrument.files.ms_tables import opened, parts, told
 from instrument.units import Bool, Complex, Int, si_prefix
 
 # of the definition, of CASA and of DP3: columns of something else than visibilities
@@ -70,12 +70,12 @@ def demand_space(path: str, visibilities: float, kept: bool = True) -> None:
 
 
 class Part(NamedTuple):
-    """Visibilities of some rows (N, F, n) as the file orders them, which are flagged, and where they belong."""
+    """Visibilities of some rows (N, F, n), which are flagged, and the rows and channels of the file they belong to."""
 
     values: Complex
     flag: Bool
     rows: Int
-    channels: slice
+    channels: Int
 
 
 def correlated(frame: Frame, data: Complex, flag: Bool, turned: Bool) -> tuple[Complex, Bool]:
@@ -89,7 +89,7 @@ def correlated(frame: Frame, data: Complex, flag: Bool, turned: Bool) -> tuple[C
     else:
         each = flag.reshape(*flag.shape[:2], 4)[..., [LINEAR.index(kind) for kind in frame.kinds]]
     values: Any = frame.correlated(data)
-    return (values[:, ::-1], each[:, ::-1]) if frame.backwards else (values, each)
+    return values, each
 
 
 def put(table: Any, name: str, part: Part, there: bool, journal: Callable[[Int, Any], None]) -> int:

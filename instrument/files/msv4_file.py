@@ -14,7 +14,8 @@ from instrument.beam_state import BeamState
 from instrument.checked import checked
 from instrument.errors import FileError, InputError
 from instrument.files.by_rows import Cells, RowFile, Rows, Where, coordinates, in_time, pairs_of
-from instrument.files.ms_frame import EQUATORIAL, NAMES, Frame, beam_state_of, beam_words, correlated, distinct
+from instrument.files.ms_frame import NAMES, Frame, beam_state_of, beam_words, correlated, distinct, in_order
+from instrument.files.ms_units import EQUATORIAL
 from instrument.files_in import harmless
 from instrument.msv4 import ANTENNAS, UNIX_S, cells, library, tree_of
 from instrument.observe.layout import Layout
@@ -130,13 +131,13 @@ class Msv4File(RowFile):
     def _cells(self, numbers: Int, channels: slice) -> Cells:
         baselines = self.main.sizes["baseline_id"]
         first, last = int(numbers.min()) // baselines, int(numbers.max()) // baselines + 1
-        some = {"time": slice(first, last), "frequency": self.frame.inside(channels, len(self.freq_hz))}
+        some = {"time": slice(first, last), "frequency": self.frame.inside(channels)}
         found = []
         with _told(self.path):
             for key in ("correlated_data", "flag", "weight"):
                 cube = self.main[self.group[key]].isel(some).values
                 flat = cube.reshape(-1, *cube.shape[2:])[numbers - first * baselines]
-                found.append(flat[:, ::-1] if self.frame.backwards else flat)
+                found.append(self.frame.ascending(flat, channels))
         return Cells(*found)
 
 
@@ -163,14 +164,14 @@ def _frame(path: str, node: Any, group: Any) -> Frame:
     if known not in ("icrs", "fk5", *EQUATORIAL):
         raise InputError(f"{path}: its phase centre is in {known}, this takes ICRS or J2000 (fk5): convert it")
     freq = np.asarray(main["frequency"].values, float)
-    back = len(freq) > 1 and bool(freq[-1] < freq[0])
+    width = np.full(len(freq), float(main["frequency"].attrs["channel_width"]["data"]))
+    freq, width, order = in_order(path, freq, width)
     kinds = correlated(path, tuple(KINDS.get(str(p), 0) for p in main["polarization"].values))
     names = distinct([str(n) for n in antennas["antenna_name"].values])
     places = np.asarray(antennas["ANTENNA_POSITION"].values, float)
     ra, dec = (float(x) for x in centre.values[0])
     towards = Direction(ra % (2 * np.pi), dec)
-    width = np.full(len(freq), float(main["frequency"].attrs["channel_width"]["data"]))
     return Frame(
         Layout.geodetic(names, places), str(antennas.attrs.get("overall_telescope_name", "")),
-        freq[::-1] if back else freq, np.abs(width), back, kinds, towards, towards, 0, 0,
+        freq, width, order, kinds, towards, towards, 0, 0,
     )  # fmt: skip

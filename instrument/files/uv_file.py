@@ -12,7 +12,7 @@ from instrument.beam_state import BeamState
 from instrument.checked import checked
 from instrument.errors import FileError, InputError, warn
 from instrument.files.by_rows import Cells, RowFile, Rows, Where, coordinates, in_time, pairs_of
-from instrument.files.ms_frame import Frame, beam_state_of, correlated, distinct, one_of
+from instrument.files.ms_frame import Frame, beam_state_of, correlated, distinct, in_order, one_of
 from instrument.files.uv_data import CORRELATIONS, library, told
 from instrument.files_in import harmless, open_regular
 from instrument.observe.directions import LIGHT
@@ -49,7 +49,7 @@ class UVFile(RowFile):
         self.drift = uv.phase_center_catalog[which]["cat_type"] == "unprojected"
         found = _centre(self.path, uv.phase_center_catalog[which], centre)
         self.channels = np.flatnonzero(uv.flex_spw_id_array == chosen)
-        self.frame = _frame(self.path, uv, self.channels, found, which)
+        self.frame = _frame(self.path, uv, chosen, found, which)
         self.beam_state = _beam_state(uv.extra_keywords, self.path)
         self.doubled = uv.pol_convention == SUM
         self.rows, self._one, self._two = _rows(self.path, uv, which)
@@ -71,12 +71,12 @@ class UVFile(RowFile):
 
     def _cells(self, numbers: Int, channels: slice) -> Cells:
         order = np.argsort(numbers)
-        inside = self.frame.inside(channels, len(self.channels))
+        inside = self.frame.inside(channels)
         some: dict[str, Any] = {"blt_inds": numbers[order], "freq_chans": self.channels[inside]}
         uv = self._read(**some)
         rows = np.argsort(order)  # as they were asked for
-        step = -1 if self.frame.backwards else 1
-        return Cells(*(x[rows][:, ::step] for x in (uv.data_array, uv.flag_array, uv.nsample_array)))
+        arrays = (uv.data_array, uv.flag_array, uv.nsample_array)
+        return Cells(*(self.frame.ascending(x[rows], channels) for x in arrays))
 
     def _read(self, **how: Any) -> Any:
         """What pyuvdata reads."""
@@ -135,20 +135,18 @@ def _centre(path: str, entry: Any, given: Any) -> Direction:
     return Direction(float(np.ravel(entry["cat_lon"])[0]) % (2 * np.pi), float(np.ravel(entry["cat_lat"])[0]))
 
 
-def _frame(path: str, uv: Any, channels: Int, centre: Direction, field: int) -> Frame:
+def _frame(path: str, uv: Any, window: int, centre: Direction, field: int) -> Frame:
+    channels = np.flatnonzero(uv.flex_spw_id_array == window)
     scope = uv.telescope
     freq, width = np.asarray(uv.freq_array, float)[channels], np.abs(np.asarray(uv.channel_width, float))[channels]
-    steps = np.diff(freq)
-    if not (np.all(steps > 0) or np.all(steps < 0)) or not np.all(np.isfinite(freq) & (freq > 0) & (width > 0)):
-        raise FileError(f"{path}: channels are not positive frequencies in order, each once")
-    step = -1 if steps.size and steps[0] < 0 else 1
+    freq, width, order = in_order(f"{path}: window {window}", freq, width)
     kinds = correlated(path, tuple(CORRELATIONS.get(int(k), int(k)) for k in uv.polarization_array))
     with told(path):
         site = np.array([getattr(scope.location, axis).to_value("m") for axis in "xyz"])
         places, names = site + scope.antenna_positions, distinct([str(n).strip() for n in scope.antenna_names])
     return Frame(
-        Layout.geodetic(names, places), str(scope.name or ""), freq[::step], width[::step], step < 0, kinds, centre,
-        centre, field, 0,
+        Layout.geodetic(names, places), str(scope.name or ""), freq, width, order, kinds, centre, centre,
+        field, 0,
     )  # fmt: skip
 
 

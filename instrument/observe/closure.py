@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from instrument.errors import InputError
+from instrument.observe.directions import LIGHT
 from instrument.units import Bool, Float, Int
 
 CLOSURE_M = 1e-6  # 3e-6 rad of phase at 150 MHz
@@ -30,13 +31,13 @@ def stations_of(uvw_m: Float, antenna1: Int, antenna2: Int, count: int) -> Float
     return np.asarray(found)
 
 
-def stations_seen(uvw_m: Float, seen: Bool, antenna1: Int, antenna2: Int, ours_m: Float) -> Float | None:
-    """Stations (T, A, 3), m, of baselines (T, B, 3) of which some were not seen (T, B); `None` where they do not close.
+def stations_seen(uvw_m: Float, seen: Bool, antenna1: Int, antenna2: Int, ours_m: Float) -> tuple[Float, float]:
+    """Stations (T, A, 3), m, of baselines (T, B, 3) of which some were not seen (T, B); by how much these do not close.
 
     What no baseline tells, where a group of stations stands as a whole, is nearest to `ours_m` (T, A, 3).
     """
     count, one, two = ours_m.shape[1], antenna1, antenna2
-    found = ours_m.copy()
+    found, most = ours_m.copy(), 0.0
     kinds, of = np.unique(seen, axis=0, return_inverse=True)
     for k, there in enumerate(kinds):
         times = np.flatnonzero(of.ravel() == k)
@@ -48,6 +49,13 @@ def stations_seen(uvw_m: Float, seen: Bool, antenna1: Int, antenna2: Int, ours_m
         moved = np.linalg.pinv(matrix.T @ matrix, hermitian=True) @ right
         found[times] += moved.reshape(count, len(times), 3).transpose(1, 0, 2)
         apart = np.abs(found[times][:, a] - found[times][:, b] - uvw_m[times][:, there])
-        if apart.max(initial=0.0) > CLOSURE_M:
-            return None
-    return found
+        most = max(most, float(apart.max(initial=0.0)))
+    return found, most
+
+
+def rounding_m(uvw_m: Float) -> float:
+    """By how much baselines (..., 3) in m may fail to close: more where all of them, or their delays, are singles."""
+    for values in (uvw_m, uvw_m / LIGHT):  # metres, or seconds as in UVFITS
+        if np.all(np.abs(values.astype(np.float32) - values) <= 4 * np.finfo(float).eps * np.abs(values)):
+            return max(CLOSURE_M, 4 * float(np.finfo(np.float32).eps) * float(np.abs(uvw_m).max(initial=0.0)))
+    return CLOSURE_M

@@ -202,7 +202,8 @@ class Seen(VisibilitySet):
                 )
             weight[bad], flag[bad] = 0.0, True
         weight[:, :, ~self.there], flag[:, :, ~self.there] = 0.0, True
-        made = replace(block, data=data, weight=weight, flag=flag, beam_state=found.beam_state)
+        own = found.interval_s if np.ptp(self.source.rows.interval_s) else block.interval_s
+        made = replace(block, data=data, weight=weight, flag=flag, interval_s=own, beam_state=found.beam_state)
         if self.put_back is None:
             return made
         return made.corrupted(Towards(chain=self.put_back, direction=found.beam_state.towards))
