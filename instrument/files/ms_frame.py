@@ -21,6 +21,7 @@ LINEAR, CIRCULAR = (9, 10, 11, 12), (5, 6, 7, 8)  # XX XY YX YY, RR RL LR LL (ca
 NAMES = {1: "I", 2: "Q", 3: "U", 4: "V", **dict(zip(CIRCULAR, ("RR", "RL", "LR", "LL"), strict=True)),
          **dict(zip(LINEAR, ("XX", "XY", "YX", "YY"), strict=True))}  # fmt: skip
 LISTED = 8  # numbers of windows or fields that a message tells
+SAME_RAD = 1e-12  # rounding of units: directions as near as this are one
 DEEP_M = 1e6  # from the centre of the Earth: nearer than this stands nothing
 TOPOCENTRIC = (1, 5)  # of channels: at rest, topocentric
 # receptors R, L of X, Y as IAU has them, with which RR = I + V
@@ -193,7 +194,8 @@ def _directions(path: str, field: int) -> tuple[Direction, Direction]:
             raise FileError(f"{path}: rows are of field {field}, of {table.nrow()} that are described")
         names = [name for name in ("PHASE_DIR", "DELAY_DIR") if name in table.columns()]
         found = [Direction(*direction_at(table, name, field, path)) for name in names]
-    return found[0], found[-1]
+    same = np.abs(np.array(found[-1]) - found[0]).max() < SAME_RAD
+    return found[0], found[0] if same else found[-1]
 
 
 def _stations(path: str) -> tuple[Layout, str, tuple[int, ...]]:
