@@ -44,7 +44,7 @@ def _wait(folder: str, lock: str, writable: bool) -> None:
     until = time.monotonic() + WAIT_S
     while (owner := holder(lock, writable)) is not None:
         if time.monotonic() > until:
-            who = f" ({owner})" if owner > 0 else ""
+            who = f" (number {owner})" if owner > 0 else ""
             raise FileError(f"{folder} is locked by another process{who}: wait until it has done, or close it there")
         time.sleep(0.1)
 

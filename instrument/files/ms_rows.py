@@ -9,10 +9,9 @@ import numpy as np
 from instrument.errors import FileError
 from instrument.files.by_rows import Rows, in_time, pairs_of
 from instrument.files.ms_frame import Frame
-from instrument.files.ms_tables import AT_ONCE, column, parts, told
+from instrument.files.ms_tables import AT_ONCE, parts, told
 from instrument.files.ms_units import in_unit, utc
 from instrument.units import Complex, Int
-
 
 
 def filled(table: Any, name: str, rows: Rows, path: str) -> bool:

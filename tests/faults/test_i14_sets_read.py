@@ -425,7 +425,7 @@ def test_a_set_that_another_process_keeps_locked_is_refused_after_a_while(copied
     one = MeasurementSet(copied)
     with held(copied, how) as other:
         begun = time.monotonic()
-        refused(copied, re.escape(f"is locked by another process ({other.pid}): wait until"), FileError)
+        refused(copied, re.escape(f"is locked by another process (number {other.pid}): wait until"), FileError)
         with pytest.raises(FileError, match="is locked by another process"):
             one.write("COPY", [])
         assert 0.9 < time.monotonic() - begun < 5
