@@ -76,6 +76,7 @@ class RowFile(VisibilitySet):
 
     _which = ""  # of what there is in the file, for the text
     column = ""  # where it has several
+    closes = True  # whether its UVW are those of stations, once it is `observed`
 
     @property
     def named(self) -> str:
@@ -97,7 +98,23 @@ class RowFile(VisibilitySet):
 
         Raises `InputError` where the UVW are not those of stations, or integrations have no length; it has the longest.
         """
-        return recorded(self.path, self.frame, self.rows, (self._coordinates(times) for times in self._steps()))
+        found = self.observed()
+        self.demand_closing()
+        return found
+
+    def observed(self) -> Recorded:
+        """The same for what is not predicted: where UVW do not close, stations have those of the IERS Earth."""
+        parts = (self._coordinates(times) for times in self._steps())
+        found, self.closes = recorded(self.path, self.frame, self.rows, parts)
+        return found
+
+    def demand_closing(self) -> None:
+        """Raise `InputError` where what was `observed` has UVW that are not those of stations."""
+        if not self.closes:
+            raise InputError(
+                f"{self.path}: its UVW do not close around triangles of stations: it can be imaged as it stands; for a "
+                "model write UVW of stations first (CASA's fixvis)"
+            )
 
     def part(self, block: Visibilities, which: Int | None = None) -> Visibilities:
         """The visibilities of the times and channels of another block, all baselines of the file or some, by number.
@@ -283,10 +300,10 @@ def block_of(
     )  # fmt: skip
 
 
-def recorded(path: str, frame: Frame, rows: Rows, parts: Iterable[Where]) -> Recorded:
-    """The observation of a file, of the coordinates of all its times; raises `InputError` where it is none to predict.
+def recorded(path: str, frame: Frame, rows: Rows, parts: Iterable[Where]) -> tuple[Recorded, bool]:
+    """The observation of a file, of the coordinates of all its times, and whether its UVW are those of stations.
 
-    That is where the UVW are not those of stations, or integrations have no length.
+    Raises `InputError` where integrations have no length.
     """
     longest = float(rows.interval_s.max())
     if not (np.all(rows.interval_s >= 0) and 0 < longest < np.inf):
@@ -296,15 +313,11 @@ def recorded(path: str, frame: Frame, rows: Rows, parts: Iterable[Where]) -> Rec
             f"{path}: integrations of {rows.interval_s.min():g} to {longest:g} s: what is predicted is smeared as the "
             "longest are"
         )
-    first, found, width = None, [], frame.width_hz
+    first, found, width, closes = None, [], frame.width_hz, True
     for part in parts:
-        if part.given_uvw_m is not None:
-            raise InputError(
-                f"{path}: its UVW do not close around triangles of stations, as scenes need it: write UVW of stations "
-                "(CASA's fixvis); in Python Imager.image takes the set as it is"
-            )
+        closes = closes and part.given_uvw_m is None
         first = first or part.at
         found.append(part.at.uvw_m)
     assert first is not None
     at = replace(first, slots_s=rows.slots_s, own_uvw_m=np.concatenate(found))
-    return Recorded.of(at, longest, float(width[0]) if np.ptp(width) == 0 else None)
+    return Recorded.of(at, longest, float(width[0]) if np.ptp(width) == 0 else None), closes

@@ -63,7 +63,8 @@ class SceneFile(Component):
     def stages(self) -> dict[str, Stage]:
         """Every stage that is there, by its table, in the order of the run."""
         beside = Beside(self.seed, self.tables, self.observed.width_hz)
-        return in_order({name: _stage(name, settings, beside) for name, settings in self.tables.items()})
+        made = {name: _stage(name, settings, beside) for name, settings in self.tables.items() if name != "data"}
+        return in_order(made | ({} if self.data is None else {"data": self.data}))
 
     @cached_property
     def data(self) -> Data | None:
@@ -162,6 +163,8 @@ class SceneFile(Component):
         """The uv range, in wavelengths, that holds all the products asked for; `None` when one needs all baselines."""
         ranges = [r for stage in self.running.values() for r in stage.ranges()]
         given = [r for r in ranges if r is not None]
+        if self.data is not None and not self.data.source.closes:
+            return None  # which baselines are within it only those of the data tell
         if not given or len(given) < len(ranges):
             return None
         return min(r[0] for r in given), max(r[1] for r in given)

@@ -2,6 +2,7 @@
 
 import contextlib
 import importlib.util
+import json
 import os
 import re
 import shutil
@@ -13,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy import units as u
 from astropy.time import Time
 
 import instrument
@@ -23,6 +25,10 @@ from instrument.files import ms_lock
 from instrument.files.measurement_set import MeasurementSet
 from instrument.files.ms_tables import opened
 from instrument.observe.sampling import Sampling, times_of
+from instrument.pipeline.run import stream
+from instrument.pipeline.scene_file import parse
+from instrument.pipeline.scene_text import read_tables
+from instrument.pipeline.stage import Running
 from instrument.units import Direction
 
 arrow = pytest.importorskip("arcae.lib.arrow_tables", reason="the extra 'ms'")
@@ -284,21 +290,40 @@ def test_uvw_in_single_precision_are_those_of_stations(plain, copied, unit):
     with table(copied) as t:
         t.putcol("UVW", off)
     assert read(copied).given_uvw_m is not None
-    with pytest.raises(InputError, match=r"fixvis.*; in Python Imager.image takes the set as it is"):
+    with pytest.raises(InputError, match=r"do not close .* can be imaged as it stands; .* \(CASA's fixvis\)"):
         MeasurementSet(copied).observation()
 
 
-def test_an_image_of_a_set_whose_uvw_do_not_close_is_made_in_python(plain, copied):
-    from astropy import units as u
+def cube_of(text):
+    """The cube of a scene on data, without its report."""
+    file = parse(read_tables(str(text)))
+    made = file.scene()
+    run = Running(file.name, file.seed, made.instrument, file.plan(made), file.running, modelled=False, read=True)
+    stream(run)
+    return run.results["image"].cube.data
 
-    imager = instrument.Imager(pixels=64, pixel=0.5 * u.arcmin, uv_range=(0, 2000))
-    want = imager.image(MeasurementSet(plain[0])).data
+
+def test_a_set_whose_uvw_do_not_close_is_imaged_and_not_predicted(plain, copied, tmp_path, capsys):
     with table(copied) as t:
         uvw = np.array(plain[1][3])
-        uvw[0, 0] += 1e-3
+        uvw[:: len(A)] += [3.0, 20.0, 0]
         t.putcol("UVW", uvw)
-    found = imager.image(MeasurementSet(copied)).data
-    assert 0 < np.abs(found - want).max() < 1e-3 * np.abs(want).max()
+    imager = instrument.Imager(pixels=32, pixel=1 * u.arcmin, uv_range=(0, 2000), weighting="uniform")
+    was, want = (imager.image(MeasurementSet(path)).data for path in (plain[0], copied))
+    assert np.abs(was - want).max() > 1e-3 * np.abs(want).max()
+    image = '[image]\npixels = 32\npixel = "1 arcmin"\nuv_range = [0, 2000]\nweighting = "uniform"\n'
+    data = f'[data]\nset = "{copied}"\n'
+    for stations in ("", f"stations = {json.dumps(NAMES[::-1])}\n"):
+        place = Path(scene(tmp_path, data, image))
+        place.write_text(place.read_text().replace('beam = "none"\n', f'beam = "none"\n{stations}'))
+        found = cube_of(place)
+        assert np.abs(found - want).max() < 1e-5 * np.abs(want).max()
+    again = f'[data]\nset = "{copied}"\n[into]\nset = "{tmp_path}/new.MS"\n'
+    assert main(["run", scene(tmp_path, again), "--out", str(tmp_path / "q")]) == 0
+    assert np.array_equal(read(tmp_path / "new.MS").uvw_m, read(copied).uvw_m)
+    capsys.readouterr()
+    assert main(["predict", scene(tmp_path), "--data", str(copied), "--out", str(tmp_path / "p")]) == 2
+    assert "do not close around triangles" in capsys.readouterr().err
 
 
 def test_a_short_last_integration_is_read_predicted_and_written(copied, tmp_path):

@@ -54,7 +54,7 @@ class Data(Stage):
     @cached_property
     def observation(self) -> Recorded:
         """Its observation; what was read on the way is given back before the run is planned by what is taken."""
-        found = self.source.observation()
+        found = self.source.observed()
         give_back()
         return found
 
@@ -90,6 +90,8 @@ class Data(Stage):
 
     def items(self, run: Running) -> Items:
         """The beam that is put back into data from which it has been taken out; refuse what cannot be compared."""
+        if any(stage.needs_sky for stage in run.stages.values()):
+            self.source.demand_closing()
         state = self.source.beam_state
         if not _compared(run) or state.removed == "nothing":
             return Items()
@@ -204,6 +206,11 @@ class Seen(VisibilitySet):
         weight[:, :, ~self.there], flag[:, :, ~self.there] = 0.0, True
         own = found.interval_s if np.ptp(self.source.rows.interval_s) else block.interval_s
         made = replace(block, data=data, weight=weight, flag=flag, interval_s=own, beam_state=found.beam_state)
+        if not self.source.closes:  # nothing is predicted: all that follows has the UVW of the baselines
+            uvw = block.uvw_m.copy()
+            uvw[:, self.there] = found.uvw_m[:, np.searchsorted(self.wanted, self.place[self.there])]
+            uvw[:, self.there & self.turned] *= -1
+            made = replace(made, given_uvw_m=uvw)
         if self.put_back is None:
             return made
         return made.corrupted(Towards(chain=self.put_back, direction=found.beam_state.towards))
@@ -238,7 +245,11 @@ class Seen(VisibilitySet):
         if axes:
             wide = np.where(self.turned[:, None, None], np.swapaxes(wide, -1, -2), wide)
         flag[:, :, self.place[self.there]] = wide[:, :, self.there]
+        uvw = None
+        if block.given_uvw_m is not None:
+            uvw = np.zeros((shape[0], baselines, 3))
+            uvw[:, self.place[self.there]] = (np.where(self.turned[:, None], -1, 1) * block.uvw_m)[:, self.there]
         return Visibilities(
             data, source.sampling(block), source.rows.antenna1, source.rows.antenna2, block.interval_s, block.width_hz,
-            flag=flag, beam_state=block.beam_state,
+            flag=flag, beam_state=block.beam_state, given_uvw_m=uvw,
         )  # fmt: skip
