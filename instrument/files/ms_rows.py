@@ -22,7 +22,7 @@ def filled(table: Any, name: str, rows: Rows, path: str) -> bool:
         return True  # of every row
     have, count = 0, len(rows.numbers)
     for r in range(0, count, AT_ONCE):
-        with told(f"column {name}"):
+        with told(f"{table.name()}: column {name}"):
             shapes = table.row_shapes(name, (rows.numbers[r : r + AT_ONCE],))
             have += len(shapes) - shapes.null_count
     if 0 < have < count:
@@ -57,7 +57,7 @@ def at_rows(table: Any, name: str, numbers: Int, channels: slice | None = None) 
     where: Any = np.asarray(numbers)
     if len(numbers) and numbers[-1] - numbers[0] + 1 == len(numbers) and np.all(np.diff(numbers) == 1):
         where = slice(int(numbers[0]), int(numbers[-1]) + 1)
-    with told(f"column {name}"):
+    with told(f"{table.name()}: column {name}"):
         return np.asarray(table.getcol(name, (where,) if channels is None else (where, channels)))
 
 
@@ -70,5 +70,5 @@ def pairs_at(table: Any, frame: Frame, numbers: Int) -> tuple[Int, Int]:
 def put_rows(table: Any, name: str, numbers: Int, values: Complex) -> None:
     """Write values of some rows in the precision of the column."""
     kind = np.complex128 if str(table.getcoldesc(name)["valueType"]).lower().startswith("d") else np.complex64
-    with told(f"column {name}"):
+    with told(f"{table.name()}: column {name}"):
         table.putcol(name, np.ascontiguousarray(values, kind), (np.asarray(numbers),))

@@ -84,12 +84,14 @@ def told(what: str) -> Iterator[None]:
                 "(DyscoStMan: libdyscostman) into CASACORE_LDPATH, or copy the set without it (DP3, with no "
                 "msout.storagemanager)"
             )
+        if "bucket" in text.lower():  # casacore's word for what it reads of a file at once
+            text = f"it is cut short or damaged, copy the set again ({text})"
         raise FileError(f"{harmless(what)}: {harmless(text, 300)}") from None
 
 
 def column(table: Any, name: str, rows: slice | None = None) -> Any:
     """Values of a column, (rows, ...), as an array of its own."""
-    with told(f"column {name}"):
+    with told(f"{table.name()}: column {name}"):
         if rows is None:
             return np.array(table.getcol(name))
         return np.array(table.getcol(name, (slice(rows.start, min(rows.stop, table.nrow())),)))
