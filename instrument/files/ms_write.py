@@ -183,7 +183,7 @@ def undone(path: str, name: str, folder: Path) -> Iterator[Callable[[Int, Any], 
 
     try:
         yield journal
-    except BaseException as error:
+    except BaseException as error:  # also a signal
         try:
             if there:
                 with opened(path, writable=True) as table:
@@ -198,7 +198,7 @@ def undone(path: str, name: str, folder: Path) -> Iterator[Callable[[Int, Any], 
                         file.unlink()
                 for saved in kept.glob("table.*"):
                     shutil.copy2(saved, place)
-        except Exception as second:
+        except Exception as second:  # whatever stands in the way of it is said
             raise FileError(
                 f"{path}: column {name} is neither as it was nor whole, write it again ({second}; first: {error})"
             ) from None

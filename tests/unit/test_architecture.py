@@ -25,6 +25,7 @@ LAYERS = (
     ("numbers", "compiled_cache", "terminal", "threads", "provenance", "written"),
     ("compiled",),
     ("shown",),
+    ("partial_folders",),
     ("whole_file",),
     ("units", "checked"),
     ("files_in", "memory", "machine"),
