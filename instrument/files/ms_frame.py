@@ -206,6 +206,8 @@ def _stations(path: str) -> tuple[Layout, str, tuple[int, ...]]:
     with opened(path, "ANTENNA") as table:
         demand(table, ("NAME", "POSITION"), f"{path}::ANTENNA")
         names, places = [str(n) for n in column(table, "NAME")], column(table, "POSITION")
+        if len(names) and all(n.isdigit() for n in names) and "STATION" in table.columns():  # as CASA imports UVFITS
+            names = [str(n) or names[k] for k, n in enumerate(column(table, "STATION"))]
         places = in_unit(table, "POSITION", places, "m", f"{path}::ANTENNA")
         if len(names) and (known := frame_named(table, "POSITION", 0, "ITRF", path)) != "ITRF":
             raise InputError(f"{path}: POSITION of stations is in {harmless(known, 40)}, this takes ITRF: convert it")

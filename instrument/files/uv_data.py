@@ -79,3 +79,10 @@ def name_antennas(path: Path, table: str, column: str, names: tuple[str, ...]) -
         hdus[hdus.index_of(table)] = new
         hdus.writeto(longer)
     longer.replace(path)
+
+
+def say_utc(path: Path) -> None:
+    """Say in UVFITS that times are UTC by the keyword that CASA reads: without it they are TAI there, 35 s off."""
+    from astropy.io import fits
+
+    fits.setval(path, "TIMSYS", value="UTC", extname="AIPS AN")

@@ -12,7 +12,7 @@ import numpy as np
 from instrument.checked import checked
 from instrument.errors import InputError
 from instrument.files.ms_frame import beam_words
-from instrument.files.uv_data import KINDS, library, name_antennas, telescope_of, told
+from instrument.files.uv_data import KINDS, library, name_antennas, say_utc, telescope_of, told
 from instrument.files.uv_file import JD_OF_MJD, MEAN
 from instrument.memory import afford
 from instrument.provenance import written_by
@@ -61,6 +61,7 @@ def write_uv(
         with told(path):
             uv.write_uvfits(str(partial))
             name_antennas(partial, "AIPS AN", "ANNAME", vis.layout.names)
+            say_utc(partial)
 
 
 def _rows(vis: Visibilities, precision: str, weights: type) -> dict[str, Any]:

@@ -11,10 +11,11 @@ import pytest
 def run(script, folder, *words):
     """Run a script with casatools, or skip; `CASA_PYTHON` may name the Python that has it."""
     python = os.environ.get("CASA_PYTHON", sys.executable)
-    ask = "import importlib.util as u; raise SystemExit(u.find_spec('casatools') is None)"
-    if subprocess.run([python, "-c", ask]).returncode:
-        pytest.skip("casatools is not installed (or name its Python in CASA_PYTHON)")
-    data = Path(pytest.importorskip("casacore").__file__).parent / "data"
+    ask = "import importlib.util as u; assert u.find_spec('casatools'); print(u.find_spec('casacore').origin)"
+    told = subprocess.run([python, "-c", ask], capture_output=True, text=True)
+    if told.returncode:
+        pytest.skip("casatools and casacore's data are not installed (or name their Python in CASA_PYTHON)")
+    data = Path(told.stdout.strip()).parent / "data"
     site = folder / "casasite.py"
     site.write_text(
         f"measurespath = '{data}'\ndatapath = ['{data}']\nmeasures_auto_update = data_auto_update = False\n"

@@ -126,6 +126,7 @@ def test_uvfits_says_where_its_antennas_are_and_numbers_them_from_one(tmp_path, 
     write_uv(tmp_path / "a.uvfits", made, telescope="LOFAR")
     with fits.open(tmp_path / "a.uvfits") as hdus:
         antennas = hdus["AIPS AN"]
+        assert antennas.header["TIMSYS"] == antennas.header["TIMESYS"] == "UTC"  # of CASA; of AIPS
         assert antennas.header["FRAME"] == "ITRF" and antennas.header["ARRNAM"] == "LOFAR"
         array = np.array([antennas.header[f"ARRAY{axis}"] for axis in "XYZ"])
         longitude = np.arctan2(array[1], array[0])
