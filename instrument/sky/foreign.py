@@ -16,6 +16,11 @@ TEXTS: tuple[tuple[str, str, str], ...] = (
         r"<.*\btigger\b",
         "tigger-convert writes it as text with a '#format:' line, which is read",
     ),
+    (
+        "a cluster file of SAGECal",
+        r"-?\d+\s+\d+\s+[A-Za-z]\S*(?:\s+[A-Za-z]\S*)*\s*$",
+        "it says which sources go together; the sky file beside it has the sources",
+    ),
     ("a ds9 region file", r"# region file format", "it holds no fluxes; " + TABLE),
     ("a hyperdrive source list", r"-?\s*(?:ra|flux_type|comp_type)\s*:", TABLE),
     ("JSON or YAML", r"[\[{]\s*(?:[\"{]|$)|---(?:\s|$)", TABLE),

@@ -293,6 +293,7 @@ def test_a9_oskar_is_read_with_everything_it_says(text):
         ("h.yaml", "super_sweet_source1:\n- ra: 10.0\n  dec: -27.0\n  comp_type: point\n", "hyperdrive source list"),
         ("j.json", '[\n{"name": "Cas A", "ra": "23h23m24s"}]', "is JSON"),
         ("r.reg", "# Region file format: DS9 version 4.1\nfk5\n", "is a ds9 region file"),
+        ("c.txt", "# cluster\n1 2 P1C1 P2C1\n-2 1 P3C1\n", "is a cluster file of SAGECal"),
         ("u.csv", "ra,dec\n", "no column for i"),
     ],
 )  # fmt: skip
