@@ -27,7 +27,7 @@ from instrument.pipeline.stages.image import Image, imaging
 from instrument.pipeline.work import StageWork
 from instrument.registry import load, names
 from instrument.report.page import Block, Card, Figures, Mark, Section, Table, Text, number
-from instrument.units import Float
+from instrument.units import Bool, Float
 from instrument.visibilities import Visibilities
 from instrument.whole_file import write_ecsv
 
@@ -113,6 +113,7 @@ class _CalibrateRun(StageRun):
     power: dict[str, float] = field(default_factory=dict)
     # powers of the corrected less the model, and of the model (2, T, A), of the times of blocks
     left: dict[tuple[float, ...], Float] = field(default_factory=dict)
+    empty: int = 0  # intervals without a solution all of whose data are flagged
     put_in: Float = field(default_factory=lambda: np.zeros(3))  # |J - 1|^2 on and off the diagonal, and how many
 
     @property
@@ -133,6 +134,9 @@ class _CalibrateRun(StageRun):
         corrected = block.corrected(solution.term)
         # solutions and sums are all that stays of a block: masks, data and models of a long run are GB
         self.parts.append(replace(solution, suspects=np.zeros((1, 1, 1), bool)))
+        counts = np.asarray(block.whole_weight > 0)  # without what is flagged
+        self.empty += int((~solution.converged & ~_seen(solution, block, counts)).sum())
+        counts = np.broadcast_to(counts, block.data.shape[:3])[..., None, None]
         if self.run.instrument.errors():
             with self.run.timed("errors"):
                 self.errors = self.errors or DISums(block.antenna1, block.antenna2)
@@ -145,13 +149,13 @@ class _CalibrateRun(StageRun):
         with self.run.timed("images"):
             for name, make in zip(IMAGES, made, strict=True):
                 part = make()
-                self.power[name] = self.power.get(name, 0.0) + float((np.abs(part.data) ** 2).sum())
+                self.power[name] = self.power.get(name, 0.0) + _power(part, counts)
                 if name == IMAGES[-1]:
                     times = tuple(block.at.slots_s.tolist())  # of which there are blocks of several channels
                     self.left[times] = self.left.get(times, 0.0) + powers_by_station(part, model)
                 if self.images:
                     self.images[name].add(part.flagged(corrected.flag))
-        self.power["model"] = self.power.get("model", 0.0) + float((np.abs(model.data) ** 2).sum())
+        self.power["model"] = self.power.get("model", 0.0) + _power(model, counts)
         return corrected
 
     def finish(self) -> CalibrationResult:
@@ -167,7 +171,24 @@ class _CalibrateRun(StageRun):
             share_of(np.concatenate(list(self.left.values()), axis=1)), np.concatenate(list(self.left)),
             self.run.plan.problem.interval_s,
         )  # fmt: skip
-        return CalibrationResult(solution, errors, cubes, rms, uv_range, left)
+        return CalibrationResult(solution, errors, cubes, rms, uv_range, left, self.empty)
+
+
+def _power(vis: Visibilities, counts: Bool) -> float:
+    """The sum of |V|² of what counts (T, F, B, 1, 1)."""
+    return float(np.where(counts, vis.data.real**2 + vis.data.imag**2, 0.0).sum())
+
+
+def _seen(solution: Solution, block: Visibilities, counts: Bool) -> Bool:
+    """Intervals (t, f) that have data that count (T, F, B)."""
+    term, here = solution.term, np.broadcast_to(counts.any(axis=-1), block.data.shape[:2])
+    i, j = (
+        np.abs(np.subtract.outer(cells, places)).argmin(axis=1)
+        for cells, places in ((block.at.slots_s, term.slots_s), (block.freq_hz, term.freq_hz))
+    )
+    seen = np.zeros(solution.outcome.shape, bool)
+    np.logical_or.at(seen, (i[:, None], j[None, :]), here)
+    return seen
 
 
 class LeftByStation(NamedTuple):
@@ -190,11 +211,13 @@ class CalibrationResult(StageResult):
     rms: dict[str, float]
     uv_range: tuple[float, float] | None = None  # of the images
     left: LeftByStation | None = None
+    empty: int = 0  # intervals all of whose data are flagged
 
     @property
     def passed(self) -> bool:
-        """Whether every interval converged."""
-        return bool(self.solution.converged.all())
+        """Whether every interval converged that has data."""
+        done = self.solution.converged
+        return bool(done.any()) and int(done.sum()) + self.empty == done.size
 
     def record(self) -> dict[str, Any]:
         """Outcomes, and what is left, under "calibration"."""
@@ -207,6 +230,7 @@ class CalibrationResult(StageResult):
             "summary": str(self.solution),
             "outcomes": {o.name.lower(): int((self.solution.outcome == o).sum()) for o in Outcome},
             "passed": self.passed,
+            "intervals_without_data": self.empty,
             "iterations_median": float(np.median(self.solution.iterations)),
             "visibility_rms_share": {k: self.rms[k] / self.rms["model"] for k in IMAGES if self.rms["model"]},
         }
