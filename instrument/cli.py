@@ -84,10 +84,10 @@ def _version() -> str:
     return __version__
 
 
-def _add_out(verb: argparse.ArgumentParser, text: str = "") -> None:
+def _add_out(verb: argparse.ArgumentParser, text: str = "", too: str = "") -> None:
     usual = "folder to write, new or empty (default: runs/NAME, or NAME-2, NAME-3, ... where that is taken)"
     verb.add_argument("--out", metavar="DIR", help=f"{text or usual}; nothing that is there is overwritten")
-    verb.add_argument("--force", action="store_true", help="replace an earlier run in that folder")
+    verb.add_argument("--force", action="store_true", help=f"replace an earlier run in that folder{too}")
 
 
 def _add_contests(verbs: Any) -> None:
@@ -106,14 +106,14 @@ def _add_contests(verbs: Any) -> None:
 
 
 def _add_data(verb: argparse.ArgumentParser, name: str) -> None:
-    verb.add_argument("--data", metavar="SET.MS", required=True, help="the Measurement Set, UVFITS, UVH5 or Zarr")
+    verb.add_argument("--data", metavar="SET.MS", required=True, help="a Measurement Set, UVFITS, UVH5 or Zarr")
     verb.add_argument("--column", metavar="COLUMN", help="of the visibilities (default: DATA)")
     if name in WRITES:
         verb.add_argument("--into", metavar="COLUMN", help=f"to write (default: {WRITES[name][1]}), or a new file")
     verb.add_argument("--window", type=int, metavar="N", help="spectral window, where the set has several")
     verb.add_argument("--field", type=int, metavar="N", help="field, where the set has several")
     verb.add_argument("--no-verify", action="store_true", help="leave out the check against the direct sum")
-    _add_out(verb)
+    _add_out(verb, too=", and the column or file that is named" if name in WRITES else "")
 
 
 def _add_paper(verbs: Any) -> None:

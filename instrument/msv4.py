@@ -33,7 +33,7 @@ def cells(values: Any, shape: tuple[int, ...]) -> Any:
     return np.moveaxis(wide, 1, 2).reshape(shape[0], shape[2], shape[1], 4).copy()
 
 
-def tree_of(vis: Any) -> Any:
+def tree_of(vis: Any, telescope: str = "unknown") -> Any:
     """A measurement set of version 4: the main dataset, and in it those of antennas and of the field.
 
     UVW are antenna 2 minus antenna 1; a flag, a weight and a UVW for each visibility. Raises `InputError` where
@@ -91,14 +91,15 @@ def tree_of(vis: Any) -> Any:
             "processor_info": {"type": "CORRELATOR", "sub_type": "SIMULATOR"},
         },
     )  # fmt: skip
-    return xarray.DataTree.from_dict({"/": main, f"/{ANTENNAS}": _antennas(vis.layout), f"/{FIELDS}": _field(vis)})
+    antennas = _antennas(vis.layout, telescope)
+    return xarray.DataTree.from_dict({"/": main, f"/{ANTENNAS}": antennas, f"/{FIELDS}": _field(vis)})
 
 
 def _quantity(value: float, units: str) -> dict[str, Any]:
     return {"data": value, "dims": [], "attrs": {"units": units, "type": "quantity"}}
 
 
-def _antennas(layout: Any) -> Any:
+def _antennas(layout: Any, telescope: str) -> Any:
     count = len(layout)
     place = {"units": "m", "frame": "ITRS", "coordinate_system": "geocentric", "origin_object_name": "earth",
              "type": "location"}  # fmt: skip
@@ -106,11 +107,11 @@ def _antennas(layout: Any) -> Any:
         {"ANTENNA_POSITION": (("antenna_name", "cartesian_pos_label"), np.array(layout.positions_m), place)},
         {
             "antenna_name": list(layout.names), "station_name": ("antenna_name", list(layout.names)),
-            "mount": ("antenna_name", ["UNKNOWN"] * count), "telescope_name": ("antenna_name", ["unknown"] * count),
+            "mount": ("antenna_name", ["UNKNOWN"] * count), "telescope_name": ("antenna_name", [telescope] * count),
             "receptor_label": ["pol_0", "pol_1"], "cartesian_pos_label": ["x", "y", "z"],
             "polarization_type": (("antenna_name", "receptor_label"), [["X", "Y"]] * count),
         },
-        {"type": "antenna", "overall_telescope_name": "unknown", "relocatable_antennas": False},
+        {"type": "antenna", "overall_telescope_name": telescope, "relocatable_antennas": False},
     )  # fmt: skip
 
 

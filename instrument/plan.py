@@ -104,16 +104,22 @@ class Plan(VisibilitySet):
         ]
 
     def __str__(self) -> str:
+        return self.told(True)
+
+    def told(self, predicted: bool) -> str:
+        """The lines of the plan; without those of a prediction where none is made."""
         times, channels, baselines = self.full.shape
         stations = self.full.at.shape[2]
         head = (
             f"scene {self.name}: {count_of(stations, 'station')}, {count_of(baselines, 'baseline')}, "
             f"{count_of(times, 'time')}, {count_of(channels, 'channel')} ({band_of(self.full)}), "
-            f"{self.full.sky.size}, tolerance {self.tolerance:g}"
+            + (f"{self.full.sky.size}, tolerance {self.tolerance:g}" if predicted else "no prediction")
         )
         lines = [head]
         lines += [f"kept          {i.name:<22} {i.reason}" for i in self.kept]
         lines += [f"left out      {i.name:<22} {i.reason:<46} error {i.bound:.2g}" for i in self.left_out]
+        if not predicted:
+            return "\n".join(lines)
         lines += [
             f"not modelled  {i.name:<22} {i.reason:<46}{f' error {i.bound:.2g}' if i.bound else ''}".rstrip()
             for i in self.not_modelled

@@ -72,6 +72,15 @@ def places_in(outline: Visibilities, block: Visibilities) -> tuple[slice, slice]
     return found[0], found[1]
 
 
+def in_pieces(blocks: Iterable[Visibilities], most_bytes: float = 8e6) -> Iterator[Visibilities]:
+    """Blocks cut into so few integrations that copies of their data are small."""
+    for block in blocks:
+        times, channels, baselines = block.data.shape[:3]
+        step = int(max(1, most_bytes // (64 * channels * baselines)))
+        for t in range(0, times, step):
+            yield block if step >= times else block.block(slice(t, t + step), slice(None))
+
+
 REMEDY = "these blocks can be gone through once: give the plan itself, a list of blocks, or a file of them"
 
 

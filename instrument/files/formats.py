@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from instrument.errors import InputError
+from instrument.errors import FileError, InputError
 from instrument.files.by_rows import RowFile
 from instrument.files.measurement_set import MARK, MeasurementSet
 from instrument.model import Instrument
@@ -23,6 +23,17 @@ def has_columns(path: str) -> bool:
     """Whether visibilities are written into a column of what is there: it is a Measurement Set, or nothing at all."""
     where = Path(path)
     return (where / MARK).is_file() or not where.exists()
+
+
+def known_file(path: str) -> None:
+    """Raise `FileError` for a file whose first bytes are those of no format of visibilities, or that is not there."""
+    where = Path(path)
+    if not where.is_file():
+        raise FileError(f"{path}: there is no such Measurement Set, UVFITS or UVH5 file, or set of version 4")
+    with where.open("rb") as file:
+        first = file.read(9)
+    if not first.startswith((b"SIMPLE  =", b"\x89HDF")):
+        raise FileError(f"{path} holds no visibilities: a Measurement Set, UVFITS, UVH5 or version 4 in Zarr is taken")
 
 
 def names_file(word: str) -> bool:
@@ -43,6 +54,7 @@ def source(path: str, **choice: Any) -> RowFile:
 
         return Msv4File(path, given.get("part"), given.get("column", "base"))
     if where.is_file():
+        known_file(path)
         _known(path, given, ("window", "field", "centre"), "a UVFITS or UVH5 file")
         from instrument.files.uv_file import UVFile
 
@@ -53,7 +65,8 @@ def source(path: str, **choice: Any) -> RowFile:
 
 def _known(path: str, given: dict[str, Any], known: tuple[str, ...], what: str) -> None:
     if unknown := [name for name in given if name not in known]:
-        raise InputError(f"{path} is {what}, which has no {unknown[0]} to choose: leave it out ({', '.join(known)})")
+        have = ", ".join(known)
+        raise InputError(f"{path} is {what}, which has no {unknown[0]} to choose: leave it out (it has {have})")
 
 
 def write(
@@ -68,7 +81,7 @@ def write(
     elif suffix == ZARR:
         from instrument.files.msv4_file import write_msv4
 
-        write_msv4(path, blocks, overwrite)
+        write_msv4(path, blocks, overwrite, telescope=instrument.telescope_name if instrument else "unknown")
     else:
         MeasurementSet.create(path, blocks, overwrite, instrument)
 

@@ -10,25 +10,26 @@ from typing import Any, Self
 import numpy as np
 
 from instrument.checked import checked
-from instrument.errors import FileError, InputError
+from instrument.errors import FileError, InputError, warn
 from instrument.files import ms_create
 from instrument.files.by_rows import SAME_S, Cells, RowFile, Where, coordinates, places
 from instrument.files.ms_frame import beam_state_of, beam_words, frame_of
 from instrument.files.ms_rows import at_rows, filled, pairs_at, rows_of
 from instrument.files.ms_tables import demand, kinds_of, opened, told
 from instrument.files.ms_units import in_unit
-from instrument.files.ms_write import Part, add_column, correlated, demand_column, demand_space, put, undone
+from instrument.files.ms_write import Part, add_column, correlated, demand_column, demand_space, put, stored, undone
 from instrument.model import Instrument
 from instrument.partial_folders import beside
 from instrument.store import Store
 from instrument.units import Int
 from instrument.visibilities import Visibilities, VisibilitySet
-from instrument.visibility_sets import VisibilityFile, as_set
+from instrument.visibility_sets import VisibilityFile, as_set, in_pieces
 from instrument.whole_file import whole_folder
 
 SAME_RAD = 1e-9  # phase centres as near as this are one
 NEEDED = ("TIME", "INTERVAL", "ANTENNA1", "ANTENNA2", "DATA_DESC_ID", "FIELD_ID", "UVW", "FLAG")
 
+LOSS = 1e-6  # of the rms, above which a column is said to compress what is written
 MARK = "table.dat"  # a file of every set
 
 
@@ -88,8 +89,14 @@ class MeasurementSet(RowFile):
                 there = column in table.columns()
                 if not there:
                     add_column(table, column, self.column, self.path)
-                for block in kept.blocks():
-                    lacking += put(table, column, self._placed(table, block), there, journal)
+                for number, block in enumerate(in_pieces(kept.blocks())):
+                    part = self._placed(table, block)
+                    lacking += put(table, column, part, there, journal)
+                    if not number and (apart := stored(table, column, part)) > LOSS:
+                        warn(
+                            f"column {column} of {self.path} keeps visibilities to {apart:.1e} of their rms only: its "
+                            "storage manager compresses them (Dysco); name another column to keep single precision"
+                        )
                 with told(f"column {column}"):
                     table.putcolkeywords(column, beam_words(kept.store.beam_state))
         return lacking
@@ -116,8 +123,9 @@ class MeasurementSet(RowFile):
         """
         with whole_folder(path, MARK, overwrite) as partial:
             kept = _kept(blocks, partial.parent)
-            ms_create.make(str(partial), kept.store, instrument)
-            for block in kept.blocks():
+            told_by = blocks.frame.telescope if isinstance(blocks, RowFile) else ""
+            ms_create.make(str(partial), kept.store, instrument, told_by)
+            for block in in_pieces(kept.blocks()):
                 ms_create.put(str(partial), block, kept.store)
         return cls(path)
 

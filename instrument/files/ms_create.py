@@ -28,19 +28,24 @@ NO_WEIGHT = float(np.sqrt(np.finfo(np.float32).max))  # SIGMA of weight 0: its s
 TILE_BYTES = 1e6
 
 
-def make(path: str, store: Store, instrument: Instrument | None) -> None:
-    """The set at `path`, whole but for its rows: room for them, stations, channels, field, correlations."""
+def make(path: str, store: Store, instrument: Instrument | None, told_by: str = "") -> None:
+    """The set at `path`, whole but for its rows: room for them, stations, channels, field, correlations.
+
+    Without an instrument the telescope is called as the file does that the visibilities are of (`told_by`).
+    """
     times, channels, baselines = store.shape
     cubes = {"DATA": "COMPLEX", "FLAG": "BOOLEAN", "WEIGHT_SPECTRUM": "FLOAT"}
     tile = [4, channels, int(max(1, min(times * baselines, TILE_BYTES // (32 * channels))))]
     with told(path), created(path, {name: _cube(name, kind, channels) for name, kind in cubes.items()}, tile) as table:
         table.addrows(times * baselines)
         table.putcolkeywords("DATA", beam_words(store.beam_state) | {"UNIT": "Jy"})
-    telescope = instrument.telescope_name if instrument is not None else ""
+    telescope = instrument.telescope_name if instrument is not None else told_by
+    if instrument is None and telescope == "LOFAR":
+        warn(f"{path}: no tables of its tiles and dipoles are written, so no beam is found in it: give instrument=")
     levels = _levels(instrument) if telescope == "LOFAR" else ()
     with told(path):
         _antennas(path, store.layout)
-        if telescope == "LOFAR":
+        if telescope == "LOFAR" and instrument is not None:
             _fields_of_lofar(path, store.layout, levels)
         _set_up(path, store, telescope, [level.pointing for level in levels])
 

@@ -121,6 +121,15 @@ def put(table: Any, name: str, part: Part, there: bool, journal: Callable[[Int, 
     return int((part.flag & ~flagged).sum())
 
 
+def stored(table: Any, name: str, part: Part) -> float:
+    """By how much what a column gives back of a part differs from what was written, rms over rms."""
+    inside = (slice(None), part.channels)
+    back, wanted = at_rows(table, name, part.rows)[inside], np.asarray(part.values)
+    use = np.isfinite(back) & ~part.flag
+    power = float((np.abs(wanted[use]) ** 2).sum())
+    return float(np.sqrt((np.abs(back[use] - wanted[use]) ** 2).sum() / power)) if power else 0.0
+
+
 def demand_single(values: Any, what: str) -> None:
     """Raise `InputError` for numbers that are beyond single precision."""
     most = float(np.finfo(np.float32).max)

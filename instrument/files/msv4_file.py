@@ -46,7 +46,10 @@ def _told(path: str | os.PathLike[str]) -> Iterator[None]:
 
 @checked
 def write_msv4(
-    path: str | os.PathLike[str], visibilities: VisibilitySet | Iterable[Visibilities], overwrite: bool = False
+    path: str | os.PathLike[str],
+    visibilities: VisibilitySet | Iterable[Visibilities],
+    overwrite: bool = False,
+    telescope: str = "unknown",
 ) -> None:
     """Write visibilities as a processing set of one measurement set of version 4 (xradio's schema), a Zarr folder.
 
@@ -58,7 +61,7 @@ def write_msv4(
     xarray, zarr = library(), zarr_tree.library()
     with whole_folder(path, MARK, overwrite) as partial:
         outline, blocks = outline_and_blocks(visibilities, partial.parent / "blocks.h5")
-        tree = tree_of(outline)
+        tree = tree_of(outline, telescope or "unknown")
         tree.attrs[BEAM] = beam_words(outline.beam_state)
         root = xarray.DataTree.from_dict({"/": xarray.Dataset(attrs={"type": "processing_set"})})
         root["set"] = tree

@@ -45,7 +45,9 @@ class Recorded(Observation):
         """The `Sampling` with the UVW of the file; raises `InputError` for stations that the file has not."""
         lacking = [name for name in layout.names if name not in self.names]
         if lacking:
-            raise InputError(f"the data have no station {lacking[0]}: they have {', '.join(self.names[:5])}")
+            some = ", ".join(self.names[:5]) + ", ..." * (len(self.names) > 5)
+            remedy = "give the telescope stations=observation.names"
+            raise InputError(f"the data have no station {lacking[0]}: they have {some}; {remedy}")
         at = super().sampling(layout, ra_rad, dec_rad)
         rows = [self.names.index(name) for name in layout.names]
         return replace(at, slots_s=self.slots_s, own_uvw_m=self.own_uvw_m[:, rows], steered=self.steered)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from instrument.errors import InputError
@@ -26,16 +27,19 @@ def tables_on(verb: str, tables: dict[str, Any], data: dict[str, Any], into: str
 
     Raises `InputError` where the scene lacks the table that the verb is about, and where neither is to be had.
     """
-    from instrument.files.formats import ENDINGS, has_columns, names_file
+    from instrument.files.formats import ENDINGS, has_columns, known_file, names_file
 
     if verb in STAGES[verb] and verb not in tables:
         raise InputError(f"{verb} takes its settings from a table [{verb}], which the scene has not")
     kept = {name: value for name, value in tables.items() if name in (*OWN, *STAGES[verb])}
+    if not Path(data["set"]).is_dir():
+        known_file(data["set"])
+    kept["name"] = f"{tables.get('name', 'scene')}-{verb}"  # or one verb's --force would take the folder of another
     out = kept | {"data": {name: value for name, value in data.items() if value is not None}}
     if verb not in WRITES:
         return out
     what, usual = WRITES[verb]
-    if into is None and not has_columns(data["set"]):
+    if not has_columns(data["set"]) and (into is None or not names_file(into)):
         raise InputError(f"{data['set']} has no columns to write: give --into a new file, {ENDINGS}")
     named = {"set": into} if into is not None and names_file(into) else {"column": usual if into is None else into}
     return out | {"into": {"what": what, **named, "overwrite": force}}

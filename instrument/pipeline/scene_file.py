@@ -53,7 +53,8 @@ class SceneFile(Component):
         # wrong settings of a stage are refused before anything is planned
         self.stages  # noqa: B018
         if not self.sky and (lacking := [n for n, stage in self.stages.items() if stage.needs_sky]):
-            raise InputError(f"[{lacking[0]}] needs a model of the sky: give a table [sky]")
+            remedy = ", or products = [] where it is of cubes alone" if lacking[0] == "analyze" else ""
+            raise InputError(f"[{lacking[0]}] needs a model of the sky: give a table [sky]{remedy}")
         odd = not self.name.isprintable() or self.name != self.name.strip() or len(self.name.encode()) > 200
         if not self.name or odd or any(c in self.name for c in "/\\") or self.name.startswith("."):
             raise InputError(f"name = {brief(self.name)} cannot name a folder")

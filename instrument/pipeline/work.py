@@ -95,7 +95,7 @@ class RunPlan:
         return self.peak_bytes_before + sum(self.growth.values())
 
     def __str__(self) -> str:
-        return "\n".join([str(self.plan), *self._lines()])
+        return "\n".join([self.plan.told("data" not in self.works or PREDICT in self.works), *self._lines()])
 
     def _lines(self) -> Iterator[str]:
         for name, items in self.items.items():

@@ -11,7 +11,7 @@ from astropy import units as u
 
 import instrument
 from instrument import MeasurementSet, Observation, Scene
-from instrument.errors import FileError
+from instrument.errors import FileError, InstrumentWarning
 
 pytestmark = pytest.mark.peer
 tables = pytest.importorskip("casacore.tables")
@@ -85,3 +85,5 @@ def test_a_compressed_set_is_read_or_its_manager_named(ours, peer_environment):
         assert "ysco" in str(error) and "storage manager" in str(error) and len(str(error).splitlines()) == 1
     else:
         assert with_dp3.error(found.data, vis.data, "compressed by Dysco") < 0.01
+        with pytest.warns(InstrumentWarning, match="keeps visibilities to .* of their rms only"):
+            MeasurementSet(folder / "d.MS").write("DATA", vis, overwrite=True)

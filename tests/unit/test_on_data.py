@@ -239,3 +239,27 @@ def test_a_beam_that_was_taken_out_is_put_back_where_the_data_are_compared(night
     assert do("calibrate", night, tmp_path / "c.MS") == 2
     said = capsys.readouterr().err
     assert "the model has none: read a column that has it" in said and len(said.strip().splitlines()) == 1
+
+
+def test_a_verb_has_a_folder_of_its_own_and_a_set_named_twice_its_usual_column(night, tmp_path, monkeypatch, capsys):
+    """predict --force takes no folder of calibrate; --into the set that is read writes what the verb writes."""
+    shutil.copytree(night / "perfect.MS", tmp_path / "a.MS")
+    monkeypatch.chdir(tmp_path)
+    for verb, more in (("predict", []), ("subtract", ["--into", "a.MS"]), ("predict", ["--force"])):
+        assert main([verb, str(night / "data.toml"), "--data", "a.MS", *more]) == 0
+    assert sorted(p.name for p in (tmp_path / "runs").iterdir()) == ["night-predict", "night-subtract"]
+    with arrow.Table.from_filename("a.MS") as table:
+        assert {"MODEL_DATA", "SUBTRACTED_DATA"} <= set(table.columns()) and "CORRECTED_DATA" not in table.columns()
+    capsys.readouterr()
+    for verb in ("predict", "image"):
+        assert main([verb, str(night / "data.toml"), "--data", str(night / "data.toml")]) == 2
+        assert "data.toml holds no visibilities: a Measurement Set, UVFITS" in capsys.readouterr().err
+
+
+def test_nothing_is_told_of_a_prediction_that_is_not_made(night, tmp_path, capsys):
+    shutil.copytree(night / "perfect.MS", tmp_path / "a.MS")
+    assert do("image", night, tmp_path / "a.MS") == 0
+    said = capsys.readouterr().out
+    assert "no prediction" in said and "total flux" not in said and "engine" not in said
+    page = (tmp_path / "image" / "report.html").read_text()
+    assert "a.MS" in page and "flagged, missing or not finite" in page

@@ -85,6 +85,7 @@ def test_what_a_scene_simulates_is_in_the_file(night, kind):
     wanted = parse(read_tables(str(night / "perfect.toml"))).scene().plan().run()
     assert apart(values(night / f"perfect{kind}", kind), wanted.data) < ROUNDED[kind]
     assert apart(values(night / f"seen{kind}", kind), wanted.data) > 0.01
+    assert "LOFAR" in repr(READ[kind](night / f"seen{kind}"))
 
 
 def test_predicted_subtracted_and_calibrated_into_new_files(night, kind, tmp_path, capsys):

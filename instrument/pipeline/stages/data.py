@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from instrument.observe.recorded import Recorded
 from instrument.pipeline.stage import Running, Stage, StageResult, StageRun
 from instrument.pipeline.work import Items, StageWork
 from instrument.plan import Item
+from instrument.report.page import Card
 from instrument.scene import Scene
 from instrument.units import Bool, Int, SkyDirection
 from instrument.visibilities import Visibilities, VisibilitySet
@@ -142,6 +144,11 @@ class DataResult(StageResult):
     def record(self) -> dict[str, Any]:
         """The set, its column, and the share that is flagged."""
         return {"data": {"set": self.source.path, "column": self.source.column, "flagged": self.flagged}}
+
+    def cards(self) -> list[Card]:
+        """The set, and the share that is flagged."""
+        text = f"{100 * self.flagged:.3g}\u00a0% flagged, missing or not finite"
+        return [Card("Data", Path(self.source.path).name, f"{self.source.column} {text}".strip())]
 
     def lines(self) -> list[str]:
         """The same in words."""

@@ -22,6 +22,7 @@ from instrument.pipeline.stages.data import Seen
 from instrument.pipeline.work import Items, StageWork
 from instrument.plan import Item
 from instrument.predict.base import EVERY
+from instrument.report.page import Card
 from instrument.scene import Scene
 from instrument.store import StoreWriter
 from instrument.terminal import finished
@@ -29,6 +30,7 @@ from instrument.visibilities import Visibilities
 from instrument.visibility_sets import BLOCK_BYTES, VisibilityFile
 
 KEEPING, WRITING = 1.0e-6, 1.0e-6  # seconds of a visibility: into the file beside the set, and from there into it
+USUAL = {"model": "MODEL_DATA", "difference": "SUBTRACTED_DATA"}  # columns of a set that is there
 WHAT = {"data": "the visibilities", "model": "the prediction", "difference": "visibilities less the prediction"}
 
 
@@ -57,8 +59,8 @@ class Into(Stage):
             raise InputError("needs 'set', the Measurement Set to write, where there is no [data]")
         fresh = read is None or os.path.realpath(where) != os.path.realpath(read)
         if not fresh and not has_columns(str(read)):
-            raise InputError(f"{read} has no columns to write: give 'set', a new file, {ENDINGS}")
-        usual = "DATA" if fresh else {"model": "MODEL_DATA"}.get(str(settings.get("what")), "CORRECTED_DATA")
+            raise InputError(f"{read} is what is read, and has no columns: name a new file, {ENDINGS}")
+        usual = "DATA" if fresh else USUAL.get(str(settings.get("what")), "CORRECTED_DATA")
         found = cls(**{"column": usual, **settings, "set": str(where), "fresh": fresh})
         if fresh and found.column != "DATA":
             raise InputError(f"column = '{found.column}': a new set has its visibilities in DATA")
@@ -196,6 +198,11 @@ class IntoResult(StageResult):
         """The set and column."""
         stage = {name: getattr(self.stage, name) for name in ("set", "column", "what")}
         return {"into": stage | {"not_a_number": self.lacking}}
+
+    def cards(self) -> list[Card]:
+        """Where it was written."""
+        stage = self.stage
+        return [Card("Written", Path(stage.set).name if stage.fresh else stage.column, WHAT[stage.what])]
 
     def lines(self) -> list[str]:
         """The same in words."""
