@@ -98,7 +98,8 @@ class MeasurementSet(RowFile):
                             "storage manager compresses them (Dysco); name another column to keep single precision"
                         )
                 with told(f"column {column}"):
-                    table.putcolkeywords(column, beam_words(kept.store.beam_state))
+                    unit = {} if there else {"UNIT": "Jy"}
+                    table.putcolkeywords(column, beam_words(kept.store.beam_state) | unit)
         return lacking
 
     def demand_column(self, column: str, overwrite: bool) -> None:

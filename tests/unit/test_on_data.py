@@ -263,3 +263,26 @@ def test_nothing_is_told_of_a_prediction_that_is_not_made(night, tmp_path, capsy
     assert "no prediction" in said and "total flux" not in said and "engine" not in said
     page = (tmp_path / "image" / "report.html").read_text()
     assert "a.MS" in page and "flagged, missing or not finite" in page
+
+
+def test_progress_is_told_where_visibilities_are_only_read(night, tmp_path, monkeypatch):
+    """Four blocks of a time each: a quarter done after each, of the share of the run that is theirs."""
+    from contextlib import contextmanager
+
+    from instrument.pipeline import run as running
+
+    told = []
+
+    @contextmanager
+    def bar(text):
+        yield lambda done, name="": told.append(done)
+
+    monkeypatch.setattr(running, "progress_bar", bar)
+    memory = ["--memory", "10 GB", "--set", "image.pixels=16", "--set", 'image.pixel="20 arcmin"']
+    shutil.copytree(night / "perfect.MS", tmp_path / "a.MS")
+    from instrument.plan import Plan
+
+    one = property(lambda self: [(slice(t, t + 1), slice(0, 3)) for t in range(4)])
+    monkeypatch.setattr(Plan, "slices", one)
+    assert do("image", night, tmp_path / "a.MS", *memory) == 0
+    assert len(told) > 4 and told == sorted(told) and len(set(told[:4])) == 4
