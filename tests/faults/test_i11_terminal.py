@@ -202,6 +202,7 @@ import os, signal, sys, time
 from instrument import terminal
 
 terminal.CLEANING_S = 0.2
+signal.signal(signal.SIGINT, signal.default_int_handler)  # what runs in the background may ignore it
 
 class Odd:
     def __del__(self):
