@@ -12,7 +12,7 @@ import numpy as np
 from instrument.checked import checked
 from instrument.errors import FileError, InputError, warn
 from instrument.files import ms_create
-from instrument.files.by_rows import SAME_S, Cells, RowFile, Where, coordinates, places
+from instrument.files.by_rows import FAR, SAME_S, Cells, RowFile, Where, coordinates, places
 from instrument.files.ms_frame import beam_state_of, beam_words, frame_of
 from instrument.files.ms_rows import at_rows, filled, pairs_at, rows_of
 from instrument.files.ms_tables import demand, kinds_of, opened, told
@@ -90,6 +90,8 @@ class MeasurementSet(RowFile):
                 if not there:
                     add_column(table, column, self.column, self.path)
                 for number, block in enumerate(in_pieces(kept.blocks())):
+                    if not number:
+                        self._say_uvw(block)
                     part = self._placed(table, block)
                     lacking += put(table, column, part, there, journal)
                     if not number and (apart := stored(table, column, part)) > LOSS:
@@ -186,6 +188,17 @@ class MeasurementSet(RowFile):
             raise InputError(f"the visibilities are of other times than {self.path}")
         if kept.shape[1] != self.shape[1] or np.abs(kept.freq_hz - self.freq_hz).max() > 1.0:
             raise InputError(f"the visibilities are of other channels than {self.path}")
+
+    def _say_uvw(self, block: Visibilities) -> None:
+        """Warn where visibilities have other UVW than the set, which keeps its own."""
+        where = self._coordinates(self._where(block)[0])
+        ours = where.given_uvw_m
+        if ours is None:
+            ours = where.at.uvw_m[:, self.rows.antenna1] - where.at.uvw_m[:, self.rows.antenna2]
+        apart, size = (float(np.sqrt((x**2).sum())) for x in (block.uvw_m - ours, ours))
+        if apart > FAR * size:
+            off = f"{100 * apart / size:.2g}" if size else "infinitely many"
+            warn(f"the visibilities have UVW that are {off} % off those of {self.path}, which keeps its own")
 
     def _placed(self, table: Any, block: Visibilities) -> Part:
         """A block in the rows and correlations of the file, and where its times and channels are."""

@@ -196,7 +196,7 @@ def undone(path: str, name: str, folder: Path) -> Iterator[Callable[[Int, Any], 
         try:
             if there:
                 with opened(path, writable=True) as table:
-                    for one in sorted(kept.glob("*.npz")):
+                    for one in sorted(kept.glob("*.npz"), reverse=True):  # rows may be there twice: the oldest last
                         with np.load(one) as old:
                             put_rows(table, name, old["rows"], old["values"])
                     with told(f"column {name}"):

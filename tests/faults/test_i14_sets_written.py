@@ -133,6 +133,38 @@ def test_a_column_is_as_it_was_where_its_writing_ends_half_way(one, monkeypatch,
     assert np.allclose(column(one, into), 2 * data, rtol=1e-5, atol=1e-5)
 
 
+def test_a_column_is_as_it_was_where_its_blocks_are_of_a_few_channels_each(one, monkeypatch):
+    """Rows that are written twice, channels after channels, get what they had before the first time."""
+    data, vis = column(one, "DATA"), next(MeasurementSet(one).blocks())
+    blocks = measurement_set.VisibilityFile.blocks
+    parts = [slice(0, 1), slice(1, 2), slice(2, 3)]
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            measurement_set.VisibilityFile, "blocks",
+            lambda self: (b.block(slice(None), f) for b in blocks(self) for f in parts),
+        )  # fmt: skip
+        place, count = ms_write.put, []
+
+        def stopped(*given):
+            count.append(place(*given))
+            if len(count) == 2:
+                raise KeyboardInterrupt
+            return count[-1]
+
+        patch.setattr(measurement_set, "put", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            MeasurementSet(one).write("DATA", vis.with_data(3 * vis.data), overwrite=True)
+    assert len(count) == 2 and np.array_equal(column(one, "DATA"), data)
+
+
+def test_visibilities_with_other_uvw_are_told(one):
+    vis = next(MeasurementSet(one).blocks())
+    MeasurementSet(one).write("SAME", vis)
+    other = replace(vis, at=replace(vis.at, own_uvw_m=1.5 * vis.at.uvw_m))
+    with pytest.warns(InstrumentWarning, match="UVW that are 50 % off those of"):
+        MeasurementSet(one).write("OTHER", other)
+
+
 def test_a_signal_while_a_column_is_written_leaves_the_old_one(one):
     data = column(one, "DATA")
     (one.parent / "s.toml").write_text(SCENE.replace("5 Jy", "10 Jy"))
