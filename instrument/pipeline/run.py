@@ -44,7 +44,8 @@ def run(
         result = _planned(scene_file, folder.path, memory, workers, verify)
         result.unused = ledger
         show(str(result.whole))
-        with folder, progress_bar(scene_file.name) as progress:
+        with folder, progress_bar(scene_file.name) as bar:
+            progress = _forward(bar)
             _compute(result, progress)
             progress(1 - result.whole.share(WRITE) if result.whole else 1.0, WRITE)
             with result.timed(WRITE), provenance(**_known(result)):
@@ -157,6 +158,18 @@ def stream(
             give_back()  # what the blocks took, up to 300 MB, stays with the threads that are gone
             run.results[name] = one.finish()
         passing += share(name)
+
+
+def _forward(progress: Progress) -> Progress:
+    """Progress that never goes back: sums of the shares of a run in two orders differ in their last bit."""
+    most = 0.0
+
+    def told(done: float, name: str | None = None) -> None:
+        nonlocal most
+        most = max(most, min(done, 1.0))
+        progress(most, name)
+
+    return told
 
 
 def _counted(blocks: Iterator[Visibilities], count: int, passed: Callable[[float], None]) -> Iterator[Visibilities]:

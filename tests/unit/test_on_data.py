@@ -265,6 +265,17 @@ def test_nothing_is_told_of_a_prediction_that_is_not_made(night, tmp_path, capsy
     assert "a.MS" in page and "flagged, missing or not finite" in page
 
 
+def test_progress_never_goes_back_nor_beyond_the_end():
+    """Shares of a run that are summed in two orders differ in their last bit."""
+    from instrument.pipeline.run import _forward
+
+    told = []
+    progress = _forward(lambda done, name=None: told.append(done))
+    for done in (0.1 + 0.2 + 0.3, 0.6, 0.9, 1 + 1e-16, 1.1):
+        progress(done, "x")
+    assert told == [0.1 + 0.2 + 0.3, 0.1 + 0.2 + 0.3, 0.9, 1.0, 1.0]
+
+
 def test_progress_is_told_where_visibilities_are_only_read(night, tmp_path, monkeypatch):
     """Four blocks of a time each: a quarter done after each, of the share of the run that is theirs."""
     from contextlib import contextmanager
