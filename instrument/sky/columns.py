@@ -68,6 +68,7 @@ class Survey:
     units: dict[str, str] = field(default_factory=dict)  # by kind of quantity, for files that give none
     freq_hz: float | None = None
     sizes_are_true: bool = False
+    published: str = ""  # columns that a sky is written in; those that mean nothing here are empty, and mark the table
 
 
 def _marks(*alternatives: str) -> tuple[frozenset[str], ...]:
@@ -82,6 +83,7 @@ SURVEYS = (
         {"stotal": "i", "tgssadr": "name"},
         ARCSEC_MJY,
         147.5e6,
+        published="Source_name RA DEC Total_flux Maj Min PA RMS_noise Mosaic_name",
     ),
     Survey(
         "LoTSS",
@@ -89,6 +91,7 @@ SURVEYS = (
         {"speaktot": "i", "source": "name"},
         ARCSEC_MJY,
         144e6,
+        published="Source_Name RA DEC Total_flux DC_Maj DC_Min DC_PA Isl_rms Mosaic_ID",
     ),
     Survey(
         "GLEAM",
@@ -102,6 +105,8 @@ SURVEYS = (
         },
         {"rad": "deg", "Jy": "Jy", "size": "arcsec"},
         200e6,
+        published="Name RAJ2000 DEJ2000 int_flux_wide a_wide b_wide pa_wide psf_a_wide psf_b_wide psf_pa_wide alpha "
+        "int_flux_fit_200",
     ),
     Survey(
         "NVSS",
@@ -110,6 +115,7 @@ SURVEYS = (
          "l_minaxis": "limit_minor", "nvss": "name"},
         ARCSEC_MJY,
         1.4e9,
+        published="NVSS RAJ2000 DEJ2000 S1.4 l_MajAxis MajAxis l_MinAxis MinAxis PA",
     ),
     Survey(
         "FIRST",
@@ -118,6 +124,7 @@ SURVEYS = (
         ARCSEC_MJY,
         1.4e9,
         sizes_are_true=True,
+        published="FIRST RAJ2000 DEJ2000 Fint Maj Min PA fMaj",
     ),
     Survey(
         "VLSS",
@@ -126,13 +133,22 @@ SURVEYS = (
          "vlss": "name", "vlssr": "name"},
         {"rad": "deg", "Jy": "Jy", "size": "arcsec"},
         73.8e6,
+        published="VLSS RAJ2000 DEJ2000 Si l_MajAx MajAx l_MinAx MinAx PA",
     ),
-    Survey("PyBDSF", _marks("total_flux isl_rms"), {}, {"rad": "deg", "Jy": "Jy", "size": "deg"}),
+    Survey(
+        "PyBDSF",
+        _marks("total_flux isl_rms"),
+        {},
+        {"rad": "deg", "Jy": "Jy", "size": "deg"},
+        published="Source_id RA DEC Total_flux DC_Maj DC_Min DC_PA Isl_rms Total_Q Total_U Total_V Spec_Indx",
+    ),
     Survey(
         "Aegean",
         _marks("int_flux a b psf_a psf_b"),
-        {"a": "fit_major", "b": "fit_minor", "psf_a": "psf_major", "psf_b": "psf_minor", "psf_pa": "psf_angle"},
+        {"a": "fit_major", "b": "fit_minor", "psf_a": "psf_major", "psf_b": "psf_minor", "psf_pa": "psf_angle",
+         "uuid": "name"},
         {"rad": "deg", "Jy": "Jy", "size": "arcsec"},
+        published="ra dec int_flux a b pa uuid psf_a psf_b psf_pa",
     ),
 )  # fmt: skip
 

@@ -45,14 +45,15 @@ class PointSky(Sources):
 
         return read_as(cls, path, centre, sizes, beam, frequency, incomplete)
 
-    def write(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
+    def write(self, path: str | os.PathLike[str], overwrite: bool = False, preset: str | None = None) -> None:
         """Write it by the ending of the name: .skymodel, .bbs, .txt (BBS), .csv, .ecsv, .skyh5, .osm (OSKAR).
 
-        `read` gives it back; see `writers.write_sky` for the rounding, and for what each form refuses to hold.
+        `preset` ("LoTSS", "GLEAM", "PyBDSF", ...) writes the columns and units of that catalogue into a .csv, .ecsv or
+        .fits. `read` gives it back; see `writers.write_sky` for the rounding, and for what each form refuses to hold.
         """
         from instrument.sky.writers import write_sky
 
-        write_sky(path, self, overwrite)
+        write_sky(path, self, overwrite, preset)
 
     def doubts(self, freq_hz: Float) -> dict[str, str]:
         """What its spectra make of it at some frequencies, and what was not read of its file; for the plan.

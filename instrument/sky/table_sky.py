@@ -150,9 +150,8 @@ def _without_beam(
         beam = (np.array(choices.beam_rad), np.array(choices.beam_rad), np.array(0.0))
     elif "psf_major" in values and "psf_minor" in values:
         beam = (values["psf_major"], values["psf_minor"], values.get("psf_angle", np.array(0.0)))
-    elif title == "TGSS ADR1":  # Intema et al. 2017: 25 arcsec, longer to the north where the array looks down
-        north = np.cos(np.minimum(values["dec"] - np.deg2rad(19), 0.0))
-        beam = (25 * ARCSEC / north, np.array(25 * ARCSEC), np.array(0.0))
+    elif title == "TGSS ADR1":
+        beam = tgss_beam(values["dec"])
     else:
         names = [harmless(table.columns[m].name, SHOWN) for m in ("fit_major", "fit_minor")]
         beside = {bare(n)[0] for n in [*table.others, *(c.name for c in table.columns.values())]}
@@ -180,12 +179,18 @@ def _ellipses(table: Table, values: dict[str, Float], major: str, minor: str, an
     return {"major": a, "minor": b, "angle": np.where((a == b) & ~np.isfinite(values[angle]), 0.0, values[angle])}
 
 
-def deconvolved(found: dict[str, Float], major: Float, minor: Float, angle: Float) -> dict[str, Float]:
-    """Gaussians with the beam taken out (second moments subtracted); an axis below the beam becomes 0, rad."""
+def tgss_beam(dec_rad: Float) -> tuple[Float, Float, Float]:
+    """Intema et al. 2017: 25 arcsec, longer to the north where the array looks down."""
+    north = np.cos(np.minimum(dec_rad - np.deg2rad(19), 0.0))
+    return 25 * ARCSEC / north, np.array(25 * ARCSEC), np.array(0.0)
+
+
+def deconvolved(found: dict[str, Float], major: Float, minor: Float, angle: Float, sign: int = -1) -> dict[str, Float]:
+    """Gaussians with the beam taken out (second moments subtracted), or put in; an axis below the beam becomes 0."""
     axx, ayy, axy = (
-        x - y
+        x + sign * y
         for x, y in zip(
-            _moments(found["major"], found["minor"], found["angle"]), _moments(major, minor, angle), strict=True
+            moments(found["major"], found["minor"], found["angle"]), moments(major, minor, angle), strict=True
         )
     )
     mean, half = 0.5 * (axx + ayy), np.hypot(0.5 * (axx - ayy), axy)
@@ -199,7 +204,7 @@ def deconvolved(found: dict[str, Float], major: Float, minor: Float, angle: Floa
     }
 
 
-def _moments(major: Float, minor: Float, angle: Float) -> tuple[Float, Float, Float]:
+def moments(major: Float, minor: Float, angle: Float) -> tuple[Float, Float, Float]:
     """North-north, east-east and north-east elements of a Gaussian's squared widths."""
     c, s = np.cos(angle), np.sin(angle)
     return major**2 * c**2 + minor**2 * s**2, major**2 * s**2 + minor**2 * c**2, (major**2 - minor**2) * s * c

@@ -126,7 +126,7 @@ def calls():
         ("Sampling.block", w.at.block, {"times": slice(0, 1), "channels": slice(0, 1)}),
         ("Sampling.towards", w.at.towards, {"ra_rad": np.array([2.1]), "dec_rad": np.array([0.8])}),
         ("PointSky.read", ins.PointSky.read, {"path": "none.csv", "centre": CENTRE}),
-        ("PointSky.write", w.sky.write, {"path": "none.dat", "overwrite": False}),
+        ("PointSky.write", w.sky.write, {"path": "none.dat", "overwrite": False, "preset": "LoTSS"}),
         ("PointSky.at", ins.PointSky.at, {
             "directions": CENTRE, "stokes_jy": [1.0], "frequency": 150 * u.MHz, "names": ["x"]}),
         ("PointSky.select", w.sky.select, {"rows": [0]}),
