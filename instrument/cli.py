@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import shlex
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 from instrument.cli_analyze import add_analyze, analyze
 from instrument.errors import InputError, did_you_mean
 from instrument.pipeline.on_data import HELP, WRITES, tables_on
+from instrument.provenance import command, commanded
 from instrument.terminal import DONE, FAILED, FELL_SHORT, process, show, status_of
 
 
@@ -145,7 +147,10 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace | int:
 
 
 def _verb(given: argparse.Namespace | int) -> int:
-    return given if isinstance(given, int) else int(VERBS[given.verb](given))
+    if isinstance(given, int):
+        return given
+    with commanded(shlex.join(["instrument", *given.words])):
+        return int(VERBS[given.verb](given))
 
 
 def _joined(words: Sequence[str]) -> list[str]:
@@ -209,8 +214,6 @@ def _compare(given: argparse.Namespace) -> int:
 
 
 def _precision(given: argparse.Namespace) -> int:
-    import shlex
-
     if given.peers:
         from instrument.threads import one_thread
 
@@ -218,8 +221,7 @@ def _precision(given: argparse.Namespace) -> int:
     from instrument.precision.command import Form, precision
 
     plugins = [name.strip() for name in given.plugins.split(",")] if given.plugins else []
-    command = shlex.join(["instrument", *given.words])
-    kept = precision(given.what, plugins, Form(given.quick, given.peers), given.out, show, given.force, command)
+    kept = precision(given.what, plugins, Form(given.quick, given.peers), given.out, show, given.force, command())
     return DONE if kept else FELL_SHORT
 
 
@@ -232,16 +234,13 @@ def _stress(given: argparse.Namespace) -> int:
 
 
 def _paper(given: argparse.Namespace) -> int:
-    import shlex
-
     from instrument.paper.experiments import announced, chosen, seed_of
 
     given.seed = seed_of(given.seed)
     show(announced(chosen(given.experiments), given.quick))  # before what takes seconds to load
     from instrument.paper.command import paper
 
-    words = shlex.join(["instrument", *given.words])
-    right = paper(given.experiments, given.quick, given.seed, given.out, show, given.force, words)
+    right = paper(given.experiments, given.quick, given.seed, given.out, show, given.force, command())
     return DONE if right else FELL_SHORT
 
 

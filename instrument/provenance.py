@@ -17,6 +17,7 @@ FITS_KEYS = {  # of what is known, and what it is
     "written": ("DATE", "when, UTC"),
 }
 _KNOWN: ContextVar[dict[str, str | int] | None] = ContextVar("provenance", default=None)
+_COMMAND: ContextVar[str] = ContextVar("command", default="")
 
 
 @contextmanager
@@ -27,6 +28,21 @@ def provenance(**known: str | int | None) -> Iterator[None]:
         yield
     finally:
         _KNOWN.reset(token)
+
+
+@contextmanager
+def commanded(words: str) -> Iterator[None]:
+    """What is done inside, a command line has asked for."""
+    token = _COMMAND.set(words)
+    try:
+        yield
+    finally:
+        _COMMAND.reset(token)
+
+
+def command() -> str:
+    """The command line at work, "" for none."""
+    return _COMMAND.get()
 
 
 def written_by() -> dict[str, str | int]:

@@ -14,6 +14,7 @@ from instrument.errors import FileError, InputError, warn
 from instrument.files import ms_create
 from instrument.files.by_rows import FAR, SAME_S, Cells, RowFile, Where, coordinates, places
 from instrument.files.ms_frame import beam_state_of, beam_words, frame_of
+from instrument.files.ms_history import add_history
 from instrument.files.ms_rows import at_rows, filled, pairs_at, rows_of
 from instrument.files.ms_tables import demand, kinds_of, opened, told
 from instrument.files.ms_units import in_unit
@@ -76,8 +77,9 @@ class MeasurementSet(RowFile):
         of autocorrelations and of other windows and fields, stay as they are, zero in a new column. Data are written,
         with the keywords of LOFAR on which beam has been taken out; weights and flags are not: what is flagged and not
         in the FLAG of the set is NaN, what is flagged in both stays as it was in a column that was there. The number
-        of correlations that are NaN for it. Raises `InputError` for blocks that are of something else, and for what is
-        no column for visibilities; `RefusedError` where the disk has no room.
+        of correlations that are NaN for it. HISTORY, where the set has it, gets a row. Raises `InputError` for blocks
+        that are of something else, and for what is no column for visibilities; `RefusedError` where the disk has no
+        room.
         """
         self.demand_column(column, overwrite)
         demand_space(self.path, float(np.prod(self.shape)), kept=not isinstance(blocks, VisibilityFile))
@@ -102,6 +104,9 @@ class MeasurementSet(RowFile):
                 with told(f"column {column}"):
                     unit = {} if there else {"UNIT": "Jy"}
                     table.putcolkeywords(column, beam_words(kept.store.beam_state) | unit)
+                silent = add_history(self.path, f"column {column}", folder)
+            if silent:
+                warn(f"column {column} of {self.path} is written, its HISTORY does not say so: {silent}")
         return lacking
 
     def demand_column(self, column: str, overwrite: bool) -> None:
@@ -130,6 +135,8 @@ class MeasurementSet(RowFile):
             ms_create.make(str(partial), kept.store, instrument, told_by)
             for block in in_pieces(kept.blocks()):
                 ms_create.put(str(partial), block, kept.store)
+            if silent := add_history(str(partial), "set", partial.parent):
+                raise FileError(f"{path}: {silent}")
         return cls(path)
 
     def _known(self, table: Any) -> None:

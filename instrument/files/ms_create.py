@@ -15,7 +15,6 @@ from instrument.files.ms_write import demand_single
 from instrument.jones.station import Level, StationBeam
 from instrument.model import Instrument
 from instrument.observe.layout import Layout
-from instrument.provenance import written_by
 from instrument.store import Store
 from instrument.units import Direction, Float
 from instrument.visibilities import Visibilities
@@ -157,7 +156,7 @@ def _fields_of_lofar(path: str, layout: Layout, levels: tuple[Level, ...]) -> No
 
 
 def _set_up(path: str, store: Store, telescope: str, pointings: Sequence[Any]) -> None:
-    """Field, channels, correlations, range of times, and by what the set was written."""
+    """Field, channels, correlations, range of times."""
     centre = Direction(*map(float, store.small["centre"]))
     steered = store.small.get("steered", centre)
     order, slots = np.argsort(store.freq_hz), store.slots_s
@@ -193,10 +192,6 @@ def _set_up(path: str, store: Store, telescope: str, pointings: Sequence[Any]) -
     fill(path, "OBSERVATION", {
         "TELESCOPE_NAME": np.array([telescope], object), "TIME_RANGE": span, "FLAG_ROW": np.zeros(1, bool),
         "OBSERVER": np.array(["simulated"], object), "PROJECT": np.array([""], object),
-    })  # fmt: skip
-    fill(path, "HISTORY", {
-        "MESSAGE": np.array([str(written_by())], object), "TIME": middle,
-        "APPLICATION": np.array(["instrument"], object),
     })  # fmt: skip
 
 

@@ -46,7 +46,8 @@ def run(
         show(str(result.whole))
         with folder, progress_bar(scene_file.name) as bar:
             progress = _forward(bar)
-            _compute(result, progress)
+            with provenance(**_known(result)):
+                _compute(result, progress)
             progress(1 - result.whole.share(WRITE) if result.whole else 1.0, WRITE)
             with result.timed(WRITE), provenance(**_known(result)):
                 _write(result, tables, folder.partial)

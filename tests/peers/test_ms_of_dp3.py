@@ -21,6 +21,7 @@ if importlib.util.find_spec("dp3") is None:
 spec = importlib.util.spec_from_file_location("with_dp3", Path(__file__).with_name("test_dp3.py"))
 with_dp3 = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(with_dp3)
+BY = f"written by instrument {instrument.__version__}"
 STATIONS = ["CS001HBA0", "CS002HBA1", "CS003HBA0", "CS302HBA1", "RS106HBA"]
 NIGHT = Observation(
     phase_centre="08h13m36.0s +48d13m03s", transit="2012-12-07", duration=40 * u.s, interval=10 * u.s,
@@ -73,6 +74,10 @@ def test_an_averaged_set_of_dp3_is_read_predicted_into_and_corrected(ours, peer_
         **{"msin.datacolumn": "MODEL_DATA", "msout.overwrite": True})  # fmt: skip
     again = np.concatenate([block.data for block in MeasurementSet(folder / "c.MS").blocks()])
     assert np.array_equal(again, made.data.astype(np.complex64))
+    with tables.table(str(folder / "c.MS::HISTORY"), ack=False) as history:  # of DP3, with our rows and its own
+        said, by = history.getcol("MESSAGE"), history.getcol("APPLICATION")
+        assert history.getcell("CLI_COMMAND", said.index(f"column MODEL_DATA {BY}")) == ["-"]
+    assert said[0] == f"set {BY}" and "DP3" in {name.strip() for name in by}
 
 
 def test_a_compressed_set_is_read_or_its_manager_named(ours, peer_environment):
