@@ -11,7 +11,7 @@ from typing import Any
 
 from instrument.cli_analyze import add_analyze, analyze
 from instrument.errors import InputError, did_you_mean
-from instrument.pipeline.on_data import HELP, WRITES, tables_on
+from instrument.pipeline.on_data import HELP, WRITES, can, tables_on
 from instrument.provenance import command, commanded
 from instrument.terminal import DONE, FAILED, FELL_SHORT, process, show, status_of
 
@@ -57,7 +57,8 @@ def parser() -> argparse.ArgumentParser:
     run = scene_verb("run", "Run a scene end to end and write a run folder.")
     _add_out(run)
     run.add_argument("--no-verify", action="store_true", help="leave out the check against the direct sum")
-    scene_verb("plan", "Say what would be done, left out, and at what cost; nothing is computed.")
+    plan = scene_verb("plan", "Say what would be done, left out, and at what cost; nothing is computed.")
+    _add_data(plan, "plan")
     for name, text in HELP.items():
         _add_data(scene_verb(name, text), name)
     text = "Faraday depth, power spectra, foreground removal and EoR window of FITS cubes."
@@ -108,14 +109,22 @@ def _add_contests(verbs: Any) -> None:
 
 
 def _add_data(verb: argparse.ArgumentParser, name: str) -> None:
-    verb.add_argument("--data", metavar="SET.MS", required=True, help="a Measurement Set, UVFITS, UVH5 or Zarr")
+    plan = name == "plan"
+    verb.add_argument("--data", metavar="SET.MS", required=not plan, help="a Measurement Set, UVFITS, UVH5 or Zarr")
+    if plan:
+        usual = "with --data: the plan of this verb (default: of each that the scene has tables for)"
+        verb.add_argument("--for", dest="of", metavar="VERB", choices=list(HELP), help=f"{', '.join(HELP)}; {usual}")
     verb.add_argument("--column", metavar="COLUMN", help="of the visibilities (default: DATA)")
-    if name in WRITES:
-        verb.add_argument("--into", metavar="COLUMN", help=f"to write (default: {WRITES[name][1]}), or a new file")
+    if plan or name in WRITES:
+        usual = WRITES[name][1] if name in WRITES else ", ".join(column for _, column in WRITES.values())
+        verb.add_argument("--into", metavar="COLUMN", help=f"to write (default: {usual}), or a new file")
     verb.add_argument("--window", type=int, metavar="N", help="spectral window, where the set has several")
     verb.add_argument("--field", type=int, metavar="N", help="field, where the set has several")
     verb.add_argument("--no-verify", action="store_true", help="leave out the check against the direct sum")
-    _add_out(verb, too=", and the column or file that is named" if name in WRITES else "")
+    if plan:
+        verb.add_argument("--force", action="store_true", help="as if the column or file that is named may be replaced")
+    else:
+        _add_out(verb, too=", and the column or file that is named" if name in WRITES else "")
 
 
 def _add_paper(verbs: Any) -> None:
@@ -164,14 +173,15 @@ def _joined(words: Sequence[str]) -> list[str]:
     return out
 
 
-def _scene_file(given: argparse.Namespace) -> Any:
+def _scene_file(given: argparse.Namespace, verb: str = "") -> Any:
+    """The tables of a scene with what the command line says, made to work on --data by a verb of data; and parsed."""
     from instrument.pipeline.scene_file import parse
     from instrument.pipeline.scene_text import override, read_tables
 
     tables = read_tables(given.scene)
-    if "data" in given:
+    if verb in HELP:
         names = {"set": given.data, **{name: getattr(given, name) for name in ("column", "window", "field")}}
-        tables = tables_on(given.verb, tables, names, getattr(given, "into", None), given.force)
+        tables = tables_on(verb, tables, names, getattr(given, "into", None), given.force)
     tables = override(tables, given.settings)
     for key in ("tolerance", "engine"):
         if getattr(given, key) is not None:
@@ -184,7 +194,7 @@ def _scene_file(given: argparse.Namespace) -> Any:
 def _run(given: argparse.Namespace) -> int:
     from instrument.pipeline.run import run
 
-    tables, scene_file = _scene_file(given)
+    tables, scene_file = _scene_file(given, given.verb)
     result = run(
         scene_file,
         tables,
@@ -199,11 +209,37 @@ def _run(given: argparse.Namespace) -> int:
 
 
 def _plan(given: argparse.Namespace) -> int:
+    if given.data is None:
+        for option in ("of", "column", "into", "window", "field", "force"):
+            if getattr(given, option) is not None and getattr(given, option) is not False:
+                raise InputError(f"--{'for' if option == 'of' else option} goes with --data, the visibilities")
+    verbs = [given.of or ""] if given.of or given.data is None else _verbs_for(given)
+    refused = []
+    for verb in verbs:
+        try:
+            _plan_of(given, verb)
+        except InputError as error:
+            if len(verbs) == 1:
+                raise
+            refused.append(error)
+            show(f"refused       {verb}: {error}")
+    if refused and len(refused) == len(verbs):
+        raise refused[0]
+    return DONE
+
+
+def _plan_of(given: argparse.Namespace, verb: str) -> None:
     from instrument.pipeline.planning import plan_run
 
-    _, scene_file = _scene_file(given)
-    show(str(plan_run(scene_file, scene_file.scene(), given.memory, given.workers)))
-    return DONE
+    _, scene_file = _scene_file(given, verb)
+    show(str(plan_run(scene_file, scene_file.scene(), given.memory, given.workers, not given.no_verify)))
+
+
+def _verbs_for(given: argparse.Namespace) -> list[str]:
+    from instrument.pipeline.scene_text import read_tables
+
+    tables = read_tables(given.scene)
+    return [verb for verb in HELP if can(verb, tables)]
 
 
 def _compare(given: argparse.Namespace) -> int:

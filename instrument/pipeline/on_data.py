@@ -22,6 +22,11 @@ HELP = {
 }
 
 
+def can(verb: str, tables: dict[str, Any]) -> bool:
+    """Whether a scene has the table that a verb is about."""
+    return verb not in STAGES[verb] or verb in tables
+
+
 def tables_on(verb: str, tables: dict[str, Any], data: dict[str, Any], into: str | None, force: bool) -> dict[str, Any]:
     """The tables of a scene as a verb has them: on visibilities `data`; `into` is their column, or a new file.
 
@@ -29,7 +34,7 @@ def tables_on(verb: str, tables: dict[str, Any], data: dict[str, Any], into: str
     """
     from instrument.files.formats import ENDINGS, has_columns, known_file, names_file
 
-    if verb in STAGES[verb] and verb not in tables:
+    if not can(verb, tables):
         raise InputError(f"{verb} takes its settings from a table [{verb}], which the scene has not")
     kept = {name: value for name, value in tables.items() if name in (*OWN, *STAGES[verb])}
     if not Path(data["set"]).is_dir():

@@ -1,0 +1,118 @@
+"""`instrument plan SCENE --data`: what a verb would print before it computes; nothing is written, nothing else done."""
+
+import re
+
+import pytest
+from astropy import units as u
+
+import instrument
+from instrument import MeasurementSet, Observation, Scene, write_uv
+from instrument.cli import main
+
+pytest.importorskip("arcae")
+SCENE = """name = "night"
+[instrument]
+telescope = "lofar-hba"
+beam = "none"
+[sky]
+kind = "grid"
+shape = [1, 2]
+spacing = "1 deg"
+flux = "5 Jy"
+[image]
+pixels = 16
+pixel = "20 arcmin"
+uv_range = [0, 200]
+"""
+CALIBRATE = '[calibrate]\nkind = "selfcal"\n'
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A folder with a set of two times and three stations, and scenes."""
+    folder = tmp_path_factory.mktemp("made")
+    lofar = instrument.load("telescopes", "lofar-hba", stations=("CS001HBA0", "CS002HBA1", "CS003HBA0"), beam=None)
+    night = Observation(
+        phase_centre="08h13m36.0s +48d13m03s", transit="2012-12-07", duration=20 * u.s, interval=10 * u.s,
+        frequencies=[150.0] * u.MHz, channel_width=0.2 * u.MHz,
+    )  # fmt: skip
+    sky = instrument.load("skies", "grid", shape=(1, 2), spacing=1 * u.deg, flux=5 * u.Jy).about(night.phase_centre)
+    vis = Scene(instrument=lofar, sky=sky, observation=night).plan().run()
+    MeasurementSet.create(folder / "a.MS", vis, instrument=lofar)
+    (folder / "s.toml").write_text(SCENE)
+    (folder / "c.toml").write_text(SCENE + CALIBRATE)
+    return folder
+
+
+def planned(made, *words, scene="c.toml", data="a.MS"):
+    return main(["plan", str(made / scene), "--data", str(made / data), *words])
+
+
+def steps(text):
+    """The lines of a plan, but seconds, which are measured, and the memory of this process."""
+    lines = [re.sub(r"about [\d.]+ \w+", "about", line) for line in text.splitlines()]
+    return [line for line in lines if line and not line.startswith("whole run")]
+
+
+@pytest.mark.parametrize("verb", ["predict", "calibrate", "image", "subtract"])
+def test_the_plan_of_a_verb_is_what_the_verb_prints_before_it_works(made, tmp_path, capsys, verb):
+    more = [] if verb == "image" else ["--into", str(tmp_path / "new.MS")]
+    assert planned(made, "--for", verb, *more) == 0
+    found = capsys.readouterr()
+    assert not (tmp_path / "new.MS").exists()
+    assert main([verb, str(made / "c.toml"), "--data", str(made / "a.MS"), "--out", str(tmp_path / "o"), *more]) == 0
+    told = steps(capsys.readouterr().out)
+    mine = steps(found.out)
+    assert len(mine) > 7 and told[: len(mine)] == mine
+    assert f"scene night-{verb}" in mine[0]
+
+
+def test_without_a_verb_each_that_the_scene_has_tables_for_is_planned_and_the_set_stays(made, capsys):
+    def every():
+        return {str(p): (p.stat().st_mtime_ns, p.stat().st_size) for p in (made / "a.MS").rglob("table.[df]*")}
+
+    before = every()
+    assert planned(made) == 0
+    assert re.findall("scene night-([a-z]+)", capsys.readouterr().out) == ["predict", "calibrate", "image", "subtract"]
+    assert planned(made, scene="s.toml") == 0
+    assert re.findall("scene night-([a-z]+)", capsys.readouterr().out) == ["predict", "image", "subtract"]
+    assert every() == before
+
+
+def test_what_one_verb_refuses_the_others_are_planned_for(made, capsys):
+    assert planned(made, "--into", "DATA") == 0
+    said = capsys.readouterr().out
+    assert re.findall("^refused +([a-z]+): .* has a column DATA", said, re.M) == ["predict", "calibrate", "subtract"]
+    assert re.findall("scene night-([a-z]+)", said) == ["image"]
+    assert planned(made, "--into", "DATA", "--force") == 0
+    assert "refused       predict" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["--for", "predict", "--into", "DATA"], "has a column DATA: name another one, or allow to overwrite it"),
+        (["--column", "NONE"], "has no column NONE: it has DATA"),
+        (["--for", "correct"], "--for: invalid choice: 'correct'"),
+        (["--window", "3"], "has no window 3"),
+    ],
+)
+def test_what_no_verb_can_do_is_one_line(made, capsys, words, line):
+    assert planned(made, *words) == 2
+    said = capsys.readouterr().err.strip().splitlines()
+    assert len(said) == 1 and line in said[0]
+
+
+@pytest.mark.parametrize("word", ["--for=image", "--column=DATA", "--into=X", "--window=0", "--field=0", "--force"])
+def test_what_is_told_of_data_that_are_not_there_is_refused(made, capsys, word):
+    assert main(["plan", str(made / "s.toml"), word]) == 2
+    assert capsys.readouterr().err.strip().endswith(f"{word.partition('=')[0]} goes with --data, the visibilities")
+
+
+def test_a_file_without_columns_is_planned_with_the_new_file_that_it_goes_to(made, tmp_path, capsys):
+    pytest.importorskip("pyuvdata")
+    write_uv(made / "a.uvh5", MeasurementSet(made / "a.MS"), overwrite=True)
+    assert planned(made, "--for", "subtract", data="a.uvh5") == 2
+    assert "give --into a new file" in capsys.readouterr().err
+    assert planned(made, "--for", "subtract", "--into", str(tmp_path / "b.uvh5"), data="a.uvh5") == 0
+    assert f"into {tmp_path}/b.uvh5" in capsys.readouterr().out and not (tmp_path / "b.uvh5").exists()
