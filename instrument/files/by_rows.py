@@ -76,6 +76,7 @@ class RowFile(VisibilitySet):
 
     _which = ""  # of what there is in the file, for the text
     column = ""  # where it has several
+    jansky = 1.0  # of one in the file
     closes = True  # whether its UVW are those of stations, once it is `observed`
 
     @property
@@ -159,7 +160,11 @@ class RowFile(VisibilitySet):
     def _block(self, times: slice, channels: slice, which: Int | None = None) -> Visibilities:
         """The block of some times, channels and baselines."""
         where = self._coordinates(times)
-        return block_of(self, times, channels, where, self._cells(self.rows.of(times), channels), which)
+        cells = self._cells(self.rows.of(times), channels)
+        if self.jansky != 1:
+            data = np.asarray(cells.data, complex) * self.jansky
+            cells = Cells(data, cells.flag, np.asarray(cells.weight, float) / self.jansky**2)
+        return block_of(self, times, channels, where, cells, which)
 
     @abstractmethod
     def _cells(self, numbers: Int, channels: slice) -> Cells:

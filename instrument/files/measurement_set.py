@@ -17,7 +17,7 @@ from instrument.files.ms_frame import beam_state_of, beam_words, frame_of
 from instrument.files.ms_history import add_history
 from instrument.files.ms_rows import at_rows, filled, pairs_at, rows_of
 from instrument.files.ms_tables import demand, kinds_of, opened, told
-from instrument.files.ms_units import in_unit
+from instrument.files.ms_units import in_unit, jansky, unit_of
 from instrument.files.ms_write import Part, add_column, correlated, demand_column, demand_space, put, stored, undone
 from instrument.model import Instrument
 from instrument.partial_folders import beside
@@ -38,12 +38,13 @@ MARK = "table.dat"  # a file of every set
 class MeasurementSet(RowFile):
     """One window and field of a Measurement Set: its column `column` in blocks of at most 64 MB of data.
 
-    Rows may stand in any order, times may be irregular and baselines missing (they are flagged); autocorrelations are
-    left out, with a warning. Weights are WEIGHT_SPECTRUM, or WEIGHT; flags FLAG or FLAG_ROW. The UVW of the file are
-    used, antenna 2 minus antenna 1: those of its stations (`Sampling.own_uvw_m`), or those of its baselines where they
-    do not close (`given_uvw_m`). Circular feeds come as linear ones: V = C^H V_RL C with R = (X + iY) / sqrt(2) of
-    coherencies, RR = I + V. Raises `FileError` for what is no whole set, `InputError` where a window or field is to be
-    chosen. Source of the format: Kemball & Wieringa (2000), MeasurementSet definition version 2.0.
+    Data are in Jy, from the unit of the column. Rows may stand in any order, times may be irregular and baselines
+    missing (they are flagged); autocorrelations are left out, with a warning. Weights are WEIGHT_SPECTRUM, or WEIGHT;
+    flags FLAG or FLAG_ROW. The UVW of the file are used, antenna 2 minus antenna 1: those of its stations
+    (`Sampling.own_uvw_m`), or those of its baselines where they do not close (`given_uvw_m`). Circular feeds come as
+    linear ones: V = C^H V_RL C with R = (X + iY) / sqrt(2) of coherencies, RR = I + V. Raises `FileError` for what is
+    no whole set, `InputError` where a window or field is to be chosen, and for units that are not of flux. Source of
+    the format: Kemball & Wieringa (2000), MeasurementSet definition version 2.0.
     """
 
     def __init__(
@@ -91,10 +92,11 @@ class MeasurementSet(RowFile):
                 there = column in table.columns()
                 if not there:
                     add_column(table, column, self.column, self.path)
+                unit = jansky(unit_of(table, column, self.path), f"{self.path}: {column}") if there else 1.0
                 for number, block in enumerate(in_pieces(kept.blocks())):
                     if not number:
                         self._say_uvw(block)
-                    part = self._placed(table, block)
+                    part = self._placed(table, block, unit)
                     lacking += put(table, column, part, there, journal)
                     if not number and (apart := stored(table, column, part)) > LOSS:
                         warn(
@@ -102,8 +104,8 @@ class MeasurementSet(RowFile):
                             "storage manager compresses them (Dysco); name another column to keep single precision"
                         )
                 with told(f"column {column}"):
-                    unit = {} if there else {"UNIT": "Jy"}
-                    table.putcolkeywords(column, beam_words(kept.store.beam_state) | unit)
+                    words = {} if there else {"UNIT": "Jy"}
+                    table.putcolkeywords(column, beam_words(kept.store.beam_state) | words)
                 silent = add_history(self.path, f"column {column}", folder)
             if silent:
                 warn(f"column {column} of {self.path} is written, its HISTORY does not say so: {silent}")
@@ -147,6 +149,7 @@ class MeasurementSet(RowFile):
         kind = str(table.getcoldesc(self.column).get("valueType", "")).lower()
         if "complex" not in kind:
             raise InputError(f"{self.path}: column {self.column} holds {kind}, not visibilities")
+        self.jansky = jansky(unit_of(table, self.column, self.path), f"{self.path}: {self.column}")
 
     def _cells(self, numbers: Int, channels: slice) -> Cells:
         with opened(self.path) as table:
@@ -207,8 +210,8 @@ class MeasurementSet(RowFile):
             off = f"{100 * apart / size:.2g}" if size else "infinitely many"
             warn(f"the visibilities have UVW that are {off} % off those of {self.path}, which keeps its own")
 
-    def _placed(self, table: Any, block: Visibilities) -> Part:
-        """A block in the rows and correlations of the file, and where its times and channels are."""
+    def _placed(self, table: Any, block: Visibilities, unit: float) -> Part:
+        """A block in the rows and correlations of the file and a unit of so many Jy, and its times and channels."""
         rows, frame = self.rows, self.frame
         times, channels = self._where(block)
         numbers = rows.of(times)
@@ -221,7 +224,7 @@ class MeasurementSet(RowFile):
 
         data, flag = in_rows(block.data), in_rows(block.flag)
         values, flags = correlated(frame, data, flag, one > two)
-        return Part(values, flags, numbers, frame.order[channels])
+        return Part(values / unit, flags, numbers, frame.order[channels])
 
 
 def _kept(blocks: VisibilitySet | Iterable[Visibilities], folder: Path) -> VisibilityFile:

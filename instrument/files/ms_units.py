@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from instrument.errors import FileError, InputError
+from instrument.errors import FileError, InputError, warn
 from instrument.files.ms_tables import column
 from instrument.files_in import harmless
+from instrument.sky.tables import unit_scale
 from instrument.units import Float
 
 EQUATORIAL = ("J2000", "ICRS")  # of directions: 0.02 arcsec apart
@@ -36,12 +37,32 @@ def in_unit(table: Any, name: str, values: Any, unit: str, path: str) -> Any:
 
 
 def _factor(known: str, unit: str, what: str) -> float:
-    from astropy import units as u
+    scale = unit_scale(known or unit, unit)
+    if scale is None:
+        raise InputError(f"{what} is in '{harmless(known, 40)}', which is no unit of {unit}: convert the set")
+    return scale
 
-    try:
-        return float(u.Unit(known or unit).to(unit))
-    except (ValueError, TypeError):
-        raise InputError(f"{what} is in '{harmless(known, 40)}', which is no unit of {unit}: convert the set") from None
+
+def jansky(known: Any, what: str) -> float:
+    """How many Jy one of a unit of visibilities is, or of a list of one, 1 where it says nothing.
+
+    What is "uncalib" is taken as Jy, with a warning. Raises `InputError` for units of another kind, and several.
+    """
+    names = {known} if isinstance(known, str) else {str(name) for name in known}
+    if len(names) > 1:
+        raise InputError(f"{what} has units of its correlations, {', '.join(map(harmless, sorted(names)))}: write Jy")
+    name = "".join(names).strip()
+    if name.lower() == "uncalib":
+        warn(f"{what}: its visibilities are not calibrated: they are taken as Jy")
+    return 1.0 if name.upper() in ("", "JY", "UNCALIB") else _factor(name, "Jy", what)
+
+
+def unit_of(table: Any, name: str, path: str) -> Any:
+    """The unit that a column of visibilities has by its keywords, "" for none."""
+    words = table.getcolkeywords(name)
+    if "VariableUnits" in words:
+        raise InputError(f"{path}: {name} has a unit of its own in each row: write it in Jy")
+    return words.get("QuantumUnits", words.get("UNIT", ""))
 
 
 def frame_named(table: Any, name: str, row: int, usual: str, path: str) -> str:

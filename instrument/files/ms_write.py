@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +17,7 @@ from instrument.files.ms_frame import CIRCULAR, LINEAR, Frame
 from instrument.files.ms_rows import at_rows, put_rows
 from instrument.files.ms_tables import column as values_of
 from instrument.files.ms_tables import opened, parts, told
+from instrument.files.ms_units import jansky, unit_of
 from instrument.units import Bool, Complex, Int, si_prefix
 
 # of the definition, of CASA and of DP3: columns of something else than visibilities
@@ -56,6 +58,8 @@ def demand_column(path: str, name: str, overwrite: bool, frame: Frame | None = N
             of = f" of {' x '.join(map(str, shape))}" if shape is not None else ""
             to = f" of {' x '.join(map(str, want))} (channels, correlations)" if want is not None else ""
             raise InputError(f"{path}: column {name} holds {kind}{of}, the visibilities are complex{to}: name another")
+        with warnings.catch_warnings(action="ignore"):
+            jansky(unit_of(table, name, path), f"{path}: {name}")
 
 
 def demand_space(path: str, visibilities: float, kept: bool = True) -> None:

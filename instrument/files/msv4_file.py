@@ -15,7 +15,7 @@ from instrument.checked import checked
 from instrument.errors import FileError, InputError
 from instrument.files.by_rows import Cells, RowFile, Rows, Where, coordinates, in_time, pairs_of
 from instrument.files.ms_frame import NAMES, Frame, beam_state_of, beam_words, correlated, distinct, in_order
-from instrument.files.ms_units import EQUATORIAL
+from instrument.files.ms_units import EQUATORIAL, jansky
 from instrument.files_in import harmless
 from instrument.msv4 import ANTENNAS, UNIX_S, cells, library, tree_of
 from instrument.observe.layout import Layout
@@ -101,6 +101,8 @@ class Msv4File(RowFile):
                 raise InputError(f"{self.path} has no group of data '{group}': it has {', '.join(groups)}")
             self.group, self.main = groups[group], node.to_dataset(inherit=False)
             self.frame = _frame(self.path, node, self.group)
+            data = self.group["correlated_data"]
+            self.jansky = jansky(self.main[data].attrs.get("units", "Jy"), f"{self.path}: {data}")
             self.beam_state: BeamState = beam_state_of(node.attrs.get(BEAM, {}), self.path)
             self.rows, self._one, self._two, self._uvw = self._all_rows()
         self._say_autos()
