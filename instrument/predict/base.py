@@ -111,6 +111,10 @@ class Predictor(Component):
         """Why this engine cannot serve a problem; `None` when it can."""
         return None
 
+    def skips(self, problem: Problem) -> str | None:
+        """Why it need not be tried where no engine is named: to ask it takes longer than it could save."""
+        return None
+
     def prepare(self, problem: Problem, tolerance: float) -> Prepared:
         """The engine made ready for a whole problem, which it may approximate with an error of at most `tolerance`.
 

@@ -37,7 +37,7 @@ def cheapest(problem: Problem, name: str | None, tolerance: float) -> Choice:
             refused.append((label, plugin.broken))
             continue
         engine = load("engines", label)
-        if why := engine.refuses(problem):
+        if why := engine.refuses(problem) or (engine.skips(problem) if name is None else None):
             refused.append((label, why))
         elif name in (None, label):
             try:

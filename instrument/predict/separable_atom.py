@@ -49,7 +49,7 @@ class SeparableAtom:
 
     def adjoint(self, samples: Complex, kinds: tuple[int, ...]) -> Float:
         """Images (4, Ny, Nx) of samples (N, 4), of some Stokes parameters, 0 in the others."""
-        out, there = np.zeros((4, *self.grid.pixels)), np.array(kinds, int)
+        out, there = np.zeros((4, *self.extent)), np.array(kinds, int)
         if len(there):
             cells = np.zeros(self._shape(len(there)))
             data = samples * self._turn.conj()[:, None]
@@ -57,6 +57,11 @@ class SeparableAtom:
                 self._each(parts, lambda part: write(cells, part, self._tables, self._towards, there, data))
             out[there] = self._images(cells)
         return out
+
+    @property
+    def extent(self) -> tuple[int, ...]:
+        """The shape of one image."""
+        return self.grid.pixels
 
     @cached_property
     def window(self) -> tuple[Int, Int]:
