@@ -64,7 +64,7 @@ def test_errors_stay_below_every_tolerance_and_the_bound(north_deg):
         assert rms(stokes(wrong)[..., 0]) <= 10 * tolerance * rms(stokes(due)[..., 0])
         sparse.append(ready.instants.step > 1 and ready._count < 0.9 * np.prod(full.problem.shape[::2]))
     assert any(sparse)
-    with pytest.raises(RefusedError, match="to this tolerance|too coarse for this tolerance"):
+    with pytest.raises(RefusedError, match=r"to this tolerance|too coarse for this tolerance"):
         Gridded().prepare(full.problem, 1e-8)
 
 
