@@ -14,6 +14,8 @@ from pathlib import Path
 from instrument.errors import FileError, warn
 
 PARTIAL = ".instrument-partial"  # ends the names of folders that are being written
+# files that a folder of data is told by, and what it is
+OF_DATA = {"table.dat": "a Measurement Set", "zarr.json": "data in Zarr", ".zgroup": "data in Zarr"}
 
 
 @contextmanager
@@ -42,6 +44,15 @@ def beside(target: Path) -> Iterator[Path]:
         except OSError as error:
             raise FileError(f"{target.parent}: {error.strerror or error}: nothing can be written there") from None
         yield folder
+
+
+def inside_data(target: Path) -> str:
+    """In which folder of data a path lies, and what that is; "" where it lies in none."""
+    for parent in target.resolve().parents:
+        for mark, what in OF_DATA.items():
+            if (parent / mark).is_file():
+                return f"it lies in {parent.name}, {what}"
+    return ""
 
 
 def locked_folder(target: Path) -> tuple[Path, int | None]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from instrument.errors import InputError, warn
-from instrument.partial_folders import clean, locked_folder
+from instrument.partial_folders import clean, inside_data, locked_folder
 from instrument.terminal import finished
 
 MOST_BYTES = 200e6  # of a record
@@ -26,8 +26,9 @@ class RunFolder:
 
     Inside, `partial` is where to write. Without `finish` nothing is left, not even folders made for it; what runs that
     were killed have left beside it is removed and named. `out=None` takes runs/NAME, or the next free name. Raises
-    `InputError` when the folder is not empty or cannot be made. With `force` a folder that a run wrote is replaced,
-    once everything is written; no other folder is, nor one that holds a file of `reads`.
+    `InputError` when the folder is not empty or cannot be made, or lies in a folder of data. With `force` a folder that
+    a run wrote is replaced, once everything is written; no other folder is, nor one that holds a file of `reads`, files
+    that are read or written beside it.
     """
 
     def __init__(
@@ -122,13 +123,16 @@ class RunFolder:
         return Path(os.path.relpath(folder))
 
     def _keeps(self, reads: Sequence[str | os.PathLike[str]]) -> None:
-        """Raises `InputError` where a folder would be replaced in which a file lies that is read."""
-        if self._replaces(self.path):
-            there = self.path.resolve()
-            for file in reads:
-                if there in Path(file).expanduser().resolve().parents:
-                    place = self._out if self._out is not None else self.path
-                    raise InputError(f"--out {place}: what is read lies in it ({file}); choose another")
+        """Raises `InputError` for a folder within data, and where one would go in which a file lies that is read."""
+        place, there = self._out if self._out is not None else self.path, self.path.resolve()
+        if within := inside_data(there):
+            raise InputError(f"--out {place}: {within}; choose another")
+        for file in reads:
+            lies = Path(file).expanduser().resolve()
+            if self._replaces(self.path) and there in lies.parents:
+                raise InputError(f"--out {place}: what is read lies in it ({file}); choose another")
+            if lies in (there, *there.parents) and not lies.is_dir():
+                raise InputError(f"--out {place}: it lies in {file}, which is written; choose another")
 
     @contextlib.contextmanager
     def _one_line(self):  # type: ignore[no-untyped-def]

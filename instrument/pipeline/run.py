@@ -39,7 +39,7 @@ def run(
     `tables` are the TOML tables it was made from. Raises `InputError` before anything is computed or written when the
     scene or the folder will not do. With `force` an earlier run folder is replaced.
     """
-    folder = RunFolder(scene_file.name, out, force)
+    folder = RunFolder(scene_file.name, out, force, scene_file.files())
     with unused_ledger() as ledger:
         result = _planned(scene_file, folder.path, memory, workers, verify)
         result.unused = ledger

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Iterator
 from contextlib import suppress
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Self
 
 from pydantic import Field, model_validator
@@ -88,6 +90,12 @@ class SceneFile(Component):
         assert self.observation is not None
         with _in_table("observation"):
             return self.observation.observation()
+
+    def files(self) -> list[str]:
+        """The files and folders that its tables name: what is there, and what [into] writes."""
+        into = self.tables.get("into", {}).get("set")
+        named = [text for text in _texts([self.instrument, self.sky, self.tables]) if _is_there(text)]
+        return named if into is None else [*named, str(into)]
 
     @property
     def modelled(self) -> bool:
@@ -287,3 +295,22 @@ def parse(tables: dict[str, Any]) -> SceneFile:
         **{name: value for name, value in tables.items() if name in own},
         tables={name: value for name, value in tables.items() if name in known},
     )
+
+
+def _texts(value: Any) -> Iterator[str]:
+    """Every text in tables and lists, but keys."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict):
+        for each in value.values():
+            yield from _texts(each)
+    elif isinstance(value, list | tuple):
+        for each in value:
+            yield from _texts(each)
+
+
+def _is_there(text: str) -> bool:
+    try:
+        return Path(text).expanduser().exists()
+    except (OSError, ValueError, RuntimeError):  # no name of a file
+        return False
