@@ -17,6 +17,7 @@ from instrument.observe.grid import ImageGrid
 from instrument.observe.observation import Observation
 from instrument.predict.base import EVERY, Predictor, Problem
 from instrument.predict.direct import Direct
+from instrument.registry import load
 from instrument.scene import Scene
 from instrument.sky.image import ImageSky
 from instrument.stress.bench import CENTRE, observed, points, problem, ready, small_array
@@ -85,6 +86,34 @@ def nothing(engine: Predictor) -> Answer:
     empty = ready(engine, _given((9, 8), 0.01, uvw, stokes)).sums(EVERY, EVERY)
     stokes[0, 3, 8, 0] = 1.0
     return both(held(empty, np.zeros(1), 0.0, scale=1.0), _against_direct(engine, _given((9, 8), 0.01, uvw, stokes)))
+
+
+@case("I6", "engines", "an image through which a horizon passes", "as without the pixels below it, to the bound")
+def setting(engine: Predictor) -> Answer:
+    """Dipoles on the ground, 18 deg about a centre that culminates half a degree above the horizon; one time."""
+    from astropy import units as u
+
+    grid = ImageGrid(pixels=(16, 15), pixel=0.02 * u.rad, centre=Direction(2.15, 0.93 - np.pi / 2).skycoord)
+    sky = ImageSky(grid=grid, stokes=np.random.default_rng(0).normal(size=(1, 4, 16, 15)))
+    night = Observation(
+        phase_centre=grid.centre, transit="2012-12-07", duration=10 * u.s, interval=10 * u.s,
+        frequencies=[150] * u.MHz, channel_width=0.2 * u.MHz,
+    )  # fmt: skip
+    dipoles = Composed(stations=small_array(4, spread=60.0), terms=Chain(load("elements", "dipole", height=0.5 * u.m).in_chain()))
+    given = Scene(instrument=dipoles, sky=sky, observation=night).plan(engine="direct", workers=1).problem
+    zenith = given.at.layout.axes[given.at.layout.frames[0], 2]
+    below = (given.at.towards(*grid.directions()).itrf[0] @ zenith[0] < 0).reshape(grid.pixels)
+    above = given.of(sky.with_fields(stokes=np.where(below, 0.0, sky.stokes)))
+    flux = float(above.sky.total_jy(given.at.freq_hz).max())
+    prepared = ready(engine, given)
+    found = prepared.sums(EVERY, EVERY)
+    limit = prepared.bound + 1e-11
+    share = below.mean()
+    return both(
+        held(found, Direct().sums(above), limit, scale=flux),
+        claim(0.2 < share < 0.8, f"{share:.0%} of the pixels are below"),
+        claim(bool(np.abs(found).max() > 1e-3 * flux), "it is dark"),
+    )
 
 
 # Imagers through beams -----------------------------------------------------------------------------------------------
