@@ -99,7 +99,8 @@ def setting(engine: Predictor) -> Answer:
         phase_centre=grid.centre, transit="2012-12-07", duration=10 * u.s, interval=10 * u.s,
         frequencies=[150] * u.MHz, channel_width=0.2 * u.MHz,
     )  # fmt: skip
-    dipoles = Composed(stations=small_array(4, spread=60.0), terms=Chain(load("elements", "dipole", height=0.5 * u.m).in_chain()))
+    dipole = load("elements", "dipole", height=0.5 * u.m)
+    dipoles = Composed(stations=small_array(4, spread=60.0), terms=Chain(dipole.in_chain()))
     given = Scene(instrument=dipoles, sky=sky, observation=night).plan(engine="direct", workers=1).problem
     zenith = given.at.layout.axes[given.at.layout.frames[0], 2]
     below = (given.at.towards(*grid.directions()).itrf[0] @ zenith[0] < 0).reshape(grid.pixels)

@@ -478,3 +478,13 @@ def test_every_randomness_takes_a_seed():
         if unseeded.search(line)
     ]
     assert found == []
+
+
+def test_every_test_that_is_listed_as_slow_is_there():
+    """A renamed one would be back in the default run, and its line for ever in the list."""
+    lines = [line for line in (ROOT / "tests" / "slow.txt").read_text().splitlines() if not line.startswith("#")]
+    assert lines
+    for line in lines:
+        file, _, name = line.partition("::")
+        text = (ROOT / file).read_text()
+        assert not name or f"def {name.partition('[')[0]}(" in text, line
