@@ -4,8 +4,8 @@
 
 Unpolarized sources of a power law of fluxes (slope -2.6) within 2 deg, 59 LOFAR stations, 1 hour of 10 s, 2 channels at
 150 MHz, 30 to 800 wavelengths, tolerance 1e-4. Sums are timed on the first integrations (all of them for 1000 sources,
-two for a million) and scaled, which is more than all of them take: array factors of neighbours are shared. Errors are of
-six of these at most, of visibilities within the uv range.
+two for a million) and scaled, which is more than all of them take: array factors of neighbours are shared. Errors are
+of six of these at most, of visibilities within the uv range.
 """
 
 import argparse
