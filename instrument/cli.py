@@ -180,6 +180,8 @@ def _scene_file(given: argparse.Namespace, verb: str = "") -> Any:
 
     tables = read_tables(given.scene)
     if verb in HELP:
+        if not given.data.strip():
+            raise InputError("--data is empty: name a Measurement Set, UVFITS, UVH5 or Zarr")
         names = {"set": given.data, **{name: getattr(given, name) for name in ("column", "window", "field")}}
         tables = tables_on(verb, tables, names, getattr(given, "into", None), given.force)
     tables = override(tables, given.settings)
@@ -213,18 +215,22 @@ def _plan(given: argparse.Namespace) -> int:
         for option in ("of", "column", "into", "window", "field", "force"):
             if getattr(given, option) is not None and getattr(given, option) is not False:
                 raise InputError(f"--{'for' if option == 'of' else option} goes with --data, the visibilities")
+    if given.into is not None and given.of is not None and given.of not in WRITES:
+        raise InputError(f"--into goes with {', '.join(WRITES)}: '{given.of}' writes no visibilities")
     verbs = [given.of or ""] if given.of or given.data is None else _verbs_for(given)
-    refused = []
+    refused: dict[str, InputError] = {}
     for verb in verbs:
         try:
             _plan_of(given, verb)
         except InputError as error:
-            if len(verbs) == 1:
-                raise
-            refused.append(error)
-            show(f"refused       {verb}: {error}")
-    if refused and len(refused) == len(verbs):
-        raise refused[0]
+            refused[verb] = error
+    reasons = set(map(str, refused.values()))
+    if len(refused) == len(verbs) and len(reasons) == 1:
+        raise next(iter(refused.values()))
+    for verb, why in refused.items():
+        show(f"refused       {verb}: {why}")
+    if len(refused) == len(verbs):
+        raise next(iter(refused.values()))
     return DONE
 
 

@@ -74,6 +74,8 @@ def free_folder(target: Path, mark: str, overwrite: bool) -> None:
 
 def free_file(target: Path, overwrite: bool) -> None:
     """Raise `InputError` where `whole_file` would."""
+    if "\0" in str(target):
+        raise InputError(f"{str(target)!r}: a name of a file holds no null byte")
     if os.path.lexists(target) and (not overwrite or (target.is_dir() and not target.is_symlink())):
         remedy = "choose another name" if target.is_dir() else "give overwrite=True, or another name"
         raise InputError(f"{target} exists: {remedy}")

@@ -20,7 +20,7 @@ def add_history(path: str, what: str, folder: Path) -> str:
     without HISTORY gets none.
     """
     place, kept = Path(path) / "HISTORY", folder / "history"
-    if not (place / "table.dat").is_file():
+    if place.is_symlink() or not (place / "table.dat").is_file():  # a link leads to the HISTORY of another set
         return ""
     try:
         shutil.copytree(place, kept)

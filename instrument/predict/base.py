@@ -17,7 +17,7 @@ from instrument.jones.chain import Chain
 from instrument.observe.sampling import Sampling
 from instrument.shown import short_repr
 from instrument.sky.base import PlacedSky
-from instrument.units import Complex, Int
+from instrument.units import Bool, Complex, Int
 from instrument.visibilities import BeamState, Visibilities
 
 EVERY = slice(None)
@@ -164,9 +164,17 @@ class Prepared(ABC):
         found = self.problem.block(times, channels)
         return found if pairs is None else found.between(*pairs)
 
+    def left_out(self, times: slice, channels: slice) -> Bool | None:
+        """Which visibilities of a block it leaves out, as the uv range of the problem allows, (T, F, B); or none."""
+        return None
+
     def predict(self, times: slice, channels: slice) -> Visibilities:
-        """The sums of a block with their coordinates."""
-        return self.block(times, channels).visibilities(self.sums(times, channels))
+        """The sums of a block with their coordinates; those that are left out are 0 and flagged."""
+        data, out = self.sums(times, channels), self.left_out(times, channels)
+        if out is not None:
+            data[out] = 0
+        found = self.block(times, channels).visibilities(data)
+        return found if out is None else replace(found, flag=out)
 
     def task(self, times: slice, channels: slice) -> Callable[[], Visibilities]:
         """`predict` of a block for a worker: all that goes to another process, if that is where the worker is."""

@@ -12,7 +12,7 @@ from instrument.errors import InputError, RefusedError, did_you_mean
 from instrument.predict.base import EVERY, Predictor, Prepared, Problem, Work
 from instrument.predict.rounding import total_flux
 from instrument.registry import available, load
-from instrument.units import Complex, Int, si_prefix
+from instrument.units import Bool, Complex, Int, si_prefix
 
 
 class Choice(NamedTuple):
@@ -117,6 +117,11 @@ class SumReady(Prepared):
         for ready in others:
             out += ready.sums(times, channels, pairs)
         return out
+
+    def left_out(self, times: slice, channels: slice) -> Bool | None:
+        """What any member leaves out, (T, F, B): the others alone are not what is seen."""
+        found = [out for _, member in self.ready if (out := member.ready.left_out(times, channels)) is not None]
+        return reduce(np.logical_or, found) if found else None
 
     def work(self, times: slice = EVERY, channels: slice = EVERY) -> Work:
         """Cost of some times and channels: of one member after the other, whose results are added."""

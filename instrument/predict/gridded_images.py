@@ -24,8 +24,7 @@ from instrument.predict.pairs import picked, placed
 from instrument.predict.separable import Kernels, fits, kernels_for
 from instrument.predict.separable_atom import SeparableAtom
 from instrument.predict.time_samples import TimeSamples, time_samples, windows, with_skirts
-from instrument.units import Complex, Direction, Float, Int, unit_vectors
-from instrument.visibilities import Visibilities
+from instrument.units import Bool, Complex, Direction, Float, Int, unit_vectors
 
 FEW_NODES = 3  # up to which each has a gridder of its own
 ROOT2 = 2**0.5  # the norm of the brightness of 1 Jy
@@ -86,17 +85,16 @@ class GriddedImages(ImageOperator):
             out[f] += atom.adjoint(atom.samples.gather(here), kinds)
         return out
 
-    def predict(self, times: slice, channels: slice) -> Visibilities:
-        """The sums of a block with their coordinates; what lies outside the uv range of the problem is flagged."""
-        found = super().predict(times, channels)
+    def left_out(self, times: slice, channels: slice) -> Bool | None:
+        """What lies outside the uv range of the problem, (T, F, B)."""
         if self.problem.uv_range is None:
-            return found
-        flag = np.ones(found.data.shape[:3], bool)
+            return None
+        out = np.ones(self.block(times, channels).shape, bool)
         for seen, f, first, last, channel in self._cuts(times, channels):
             begin, end = self._windows(first, last, channel)
             t = np.arange(last - first)[:, None]
-            flag[seen, f] = (t < begin) | (t >= end)
-        return replace(found, flag=flag)
+            out[seen, f] = (t < begin) | (t >= end)
+        return out
 
     def work(self, times: slice = EVERY, channels: slice = EVERY) -> Work:
         """Of the nodes, the samples and what lies between."""

@@ -233,6 +233,9 @@ def _preset_ecsv(path: Path, columns: dict[str, tuple[Any, str | None]], count: 
 def _preset_fits(path: Path, columns: dict[str, tuple[Any, str | None]], count: int, freq_hz: float | None) -> None:
     from astropy.io import fits
 
+    for name in (name for values, _ in columns.values() if isinstance(values, tuple) for name in values):
+        if not name.isascii():
+            raise InputError(f"source '{name}': FITS holds names of ASCII alone; rename it, or write .ecsv")
     hdu = fits.table_to_hdu(_table(columns, count, {}))
     hdu.header.extend(fits_cards())
     if freq_hz is not None:

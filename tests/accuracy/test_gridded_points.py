@@ -109,6 +109,36 @@ def test_a_sum_of_an_image_and_very_many_points_takes_it_for_both(monkeypatch):
     assert found.verify(samples=64).passed
 
 
+def test_what_one_member_leaves_out_is_flagged_in_the_sum(monkeypatch):
+    """A star that is summed on all baselines beside many that are known within the uv range alone."""
+    monkeypatch.setattr(gridded_points, "PRODUCTS", 1e5)
+    star = PointSky(
+        names=["far"], ra_rad=np.array([2.2]), dec_rad=np.array([0.84]), stokes_jy=np.array([[100.0, 0, 0, 0]])
+    )
+    sky = SumSky(skies={"stars": points(8000), "far": star})
+    found = plan(sky, engine=None, uv_range=(50.0, 400.0))
+    assert [member.label == "gridded" for _, member in found.ready.ready] == [True, False]
+    vis = found.run()
+    uv = np.hypot(vis.uvw_m[..., 0], vis.uvw_m[..., 1])[:, None] * vis.freq_hz[:, None] / 299792458.0
+    assert 0.1 < vis.flag.mean() < 0.9
+    flag = vis.flag.reshape(*uv.shape, -1).all(axis=-1)  # of each visibility as a whole
+    assert np.all(flag | ((uv > 50) & (uv < 400)))
+    assert not vis.data[flag].any() and np.abs(vis.data[~flag]).min() > 0
+    assert found.verify(samples=64).passed
+
+
+@pytest.mark.parametrize("flux", [1e-160, 1e-300, 1e300])
+def test_fluxes_of_any_size_are_seen_alike(flux):
+    """What transforms square would be 0, or infinite."""
+    few = slice(None, None, 60)
+    seen = []
+    for size in (1.0, flux):
+        sky = points(60)
+        full = plan(sky.with_fields(stokes_jy=sky.stokes_jy * size), uv_range=(30.0, 800.0), beam=None)
+        seen.append(Gridded().prepare(full.problem, 1e-3).sums(few, EVERY) / size)
+    assert np.abs(seen[1] - seen[0]).max() <= 1e-12 * np.abs(seen[0]).max()
+
+
 def test_what_it_does_not_do_is_refused_in_one_line():
     with pytest.raises(RefusedError, match="a source is a Gaussian"):
         plan(points(major_rad=np.full(300, 1e-4), minor_rad=np.zeros(300), angle_rad=np.zeros(300)), engine="gridded")

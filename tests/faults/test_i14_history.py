@@ -103,6 +103,15 @@ def test_a_set_without_history_is_written_without(one, recwarn):
     assert np.array_equal(next(MeasurementSet(one, "NEW").blocks()).data, next(MeasurementSet(one).blocks()).data)
 
 
+def test_the_history_of_another_set_that_a_link_leads_to_is_left_alone(one, tmp_path):
+    shutil.copytree(one, tmp_path / "b.MS")
+    shutil.rmtree(one / "HISTORY")
+    (one / "HISTORY").symlink_to(tmp_path / "b.MS" / "HISTORY")
+    before = files(tmp_path / "b.MS")
+    written(one)
+    assert files(tmp_path / "b.MS") == before
+
+
 def test_a_history_that_cannot_be_written_is_as_it_was_and_the_column_is_whole(one):
     (one / "HISTORY" / "table.dat").write_bytes(b"no table")
     before = files(one)

@@ -95,12 +95,21 @@ def test_what_one_verb_refuses_the_others_are_planned_for(made, capsys):
         (["--column", "NONE"], "has no column NONE: it has DATA"),
         (["--for", "correct"], "--for: invalid choice: 'correct'"),
         (["--window", "3"], "has no window 3"),
+        (["--for", "image", "--into", "X"], "--into goes with predict, calibrate, subtract: 'image' writes no visib"),
     ],
 )
 def test_what_no_verb_can_do_is_one_line(made, capsys, words, line):
     assert planned(made, *words) == 2
-    said = capsys.readouterr().err.strip().splitlines()
-    assert len(said) == 1 and line in said[0]
+    said = capsys.readouterr()
+    assert len(said.err.strip().splitlines()) == 1 and line in said.err
+    assert not said.out  # one reason is told once, and not for each verb
+
+
+@pytest.mark.parametrize("data", ["", " "])
+def test_data_without_a_name_are_refused_by_every_verb(made, capsys, data):
+    for verb in ("plan", "predict"):
+        assert main([verb, str(made / "c.toml"), "--data", data]) == 2
+        assert "--data is empty: name a Measurement Set" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("word", ["--for=image", "--column=DATA", "--into=X", "--window=0", "--field=0", "--force"])

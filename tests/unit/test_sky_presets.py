@@ -137,6 +137,8 @@ GIVEN = {"names": ("a",), "ra_rad": [1.0], "dec_rad": [0.5], "stokes_jy": [[1, 0
         ("TGSS", "s.csv", {"dec_rad": [-1.4]}, "source 'a' lies below -71 deg, where TGSS ADR1 has no beam"),
         ("LoTSS", "s.ecsv", {"names": (" a",)}, "LoTSS does not give source ' a' back as it is"),
         ("LoTSS", "s.csv", {"stokes_jy": [[-0.099, 0, 0, 0]]}, "cannot be written as LoTSS: .* stands for 'no data'"),
+        ("LoTSS", "s.fits", {"names": ("\u03b1",)}, "source '\u03b1': FITS holds names of ASCII alone; rename it"),
+        ("LoTSS", "s\0.csv", {}, "a name of a file holds no null byte"),
         ("LOTS", "s.csv", {}, "preset = 'LOTS' is none: did you mean 'LoTSS'"),
         ("LoTSS", "s.skymodel", {}, "s.skymodel: the name of a table of LoTSS ends in .csv, .ecsv, .fits"),
         (None, "s.fits", {}, "the name of a sky ends in .* or .fits with a preset"),
