@@ -93,9 +93,8 @@ class GriddedPoints(GriddedImages):
             one = slice(channel, channel + 1)  # the brightness of a million sources in all channels fits nowhere
             bright = self.problem.sky.brightness(self.problem.at.block(slice(0, 1), one))[0]
             fluxes: Float = np.asarray(stokes(bright).real, float)
-            size = np.ldexp(
-                1.0, int(np.frexp(np.abs(fluxes).max(initial=0.0))[1]) - 1
-            )  # transforms square what they get
+            largest = int(np.frexp(np.abs(fluxes).max(initial=0.0))[1])
+            size = np.ldexp(1.0, largest - 1)  # transforms square what they get
             seen = self.forward(np.ascontiguousarray(fluxes.swapaxes(1, 2) / size), times, one, pairs)
             out[:, f : f + 1] = np.multiply(seen, size, out=seen)
         return out
