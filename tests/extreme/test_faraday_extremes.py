@@ -179,16 +179,17 @@ def test_every_pixel_may_have_flags_of_its_own():
 # Memory -----------------------------------------------------------------------------------------------------------
 
 MAPPED = """
-import resource, sys
+import sys
 import numpy as np
 from astropy import units as u
 from instrument import Analyzer, StokesCube
+from instrument.memory import high_water
 data = np.random.default_rng(0).normal(size=(9, 4, 300, 300)).astype(np.float32)
 cube = StokesCube(data, (134 + 4 * np.arange(9)) * u.MHz, 1 * u.arcmin, "K")
 Analyzer(cube).rm_synthesis(np.linspace(-5, 5, 7), out=sys.argv[1] + "/a.npy")
-before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+before = high_water()
 found = Analyzer(cube).rm_synthesis(np.linspace(-50, 50, 1201), out=sys.argv[1] + "/b.npy")
-print(found.data.nbytes / 1e6, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1e3)
+print(found.data.nbytes / 1e6, (high_water() - before) / 1e6)
 """
 
 

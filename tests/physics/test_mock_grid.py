@@ -11,8 +11,8 @@ from astropy.table import QTable
 from astropy.wcs import WCS
 
 CHILD = (
-    "import resource, sys; from instrument.cli import main; status = main(sys.argv[1:]);"
-    "print('PEAK', resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024, flush=True); sys.exit(status)"
+    "import sys; from instrument.cli import main; from instrument.memory import high_water;"
+    "status = main(sys.argv[1:]); print('PEAK', high_water(), flush=True); sys.exit(status)"
 )
 
 
