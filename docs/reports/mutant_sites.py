@@ -136,7 +136,7 @@ class Finder(ast.NodeVisitor):
         worded = any(
             isinstance(x, words) or isinstance(getattr(x, "value", None), str) for x in (node.left, node.right)
         )
-        if isinstance(node.op, ast.MatMult):
+        if isinstance(node.op, ast.MatMult) and left != right:  # y @ y is the same either way
             self.add("operator", node, f"({right}) @ ({left})")
         elif type(node.op) in OTHER and not worded:
             self.add("operator", node, f"(({left}) {OTHER[type(node.op)]} ({right}))")
