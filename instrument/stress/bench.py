@@ -110,7 +110,13 @@ def operator(engine: Predictor, given: Problem) -> ImageOperator:
 
 def sums(engine: Predictor, given: Problem) -> Complex:
     """What an engine makes of a problem as well as it can, (T, F, B, 2, 2)."""
-    return ready(engine, given).sums(EVERY, EVERY)
+    return claimed(engine, given)[0]
+
+
+def claimed(engine: Predictor, given: Problem) -> tuple[Complex, float]:
+    """The same, and what the engine says that it is wrong by at most, Jy: 0 unless it approximates."""
+    found = ready(engine, given)
+    return found.sums(EVERY, EVERY), found.bound * float(given.sky.total_jy(given.at.freq_hz).max())
 
 
 def fringe(cycles: Any) -> Complex:

@@ -156,6 +156,24 @@ class Mirrored(Direct):
         return np.swapaxes(found, -1, -2)
 
 
+class Rough(Direct):
+    """Wrong by 1e-6 of the flux, of which it says this much."""
+
+    says: float = 0.0
+
+    def sums(self, problem):
+        return Direct().sums(problem) + 5e-7 * (1 + 1j)
+
+    def prepare(self, problem, tolerance):
+        return replace(super().prepare(problem, tolerance), bound=self.says)
+
+
+def test_an_engine_that_approximates_is_held_to_what_it_says_of_itself():
+    tried = [c for c in all_cases() if c.stage == "engines" and c.key in ("1", "5", "9", "10", "16", "X1")]
+    assert {judged(c, Rough(says=2e-9)).verdict for c in tried} == {WRONG}
+    assert {judged(c, Rough(says=2e-6)).verdict for c in tried} == {RIGHT}
+
+
 class Greedy(ForegroundRemover):
     """Fits power laws, and takes a third of all the rest away as well."""
 
