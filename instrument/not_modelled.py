@@ -44,10 +44,11 @@ def _smearing(problem: Problem) -> list[Item]:
     longest = problem.at.layout.longest_m
     parts = []
     turns = EARTH_RATE * problem.interval_s * longest * float(problem.at.freq_hz.max()) / LIGHT * far
-    parts.append(f"time {_percent(1 - np.sinc(turns))}")
+    parts.append(f"averaging over {si_prefix(problem.interval_s, 's')} would lose {_percent(1 - np.sinc(turns))}")
     if problem.width_hz:
-        parts.append(f"bandwidth {_percent(1 - np.sinc(problem.width_hz * longest / LIGHT * far))}")
-    return [Item("smearing", f"{', '.join(parts)} of the farthest source lost on the longest baseline")]
+        lost = 1 - np.sinc(problem.width_hz * longest / LIGHT * far)
+        parts.append(f"over {si_prefix(problem.width_hz, 'Hz')} {_percent(lost)}")
+    return [Item("smearing", f"{', '.join(parts)} of the farthest source on the longest baseline")]
 
 
 def _percent(lost: float) -> str:

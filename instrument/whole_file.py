@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from instrument.errors import FileError, InputError
-from instrument.partial_folders import own_folder
+from instrument.partial_folders import inside_data, own_folder
 from instrument.provenance import written_by
 
 
@@ -18,7 +18,7 @@ def whole_file(path: str | os.PathLike[str], overwrite: bool = False) -> Iterato
     """Gives a path to write to; it becomes `path` when what is inside succeeds, and is removed when it does not.
 
     Raises `InputError` for what exists, before anything is done and at the end, unless `overwrite` is given: the one
-    rule of every writer. A folder is never overwritten.
+    rule of every writer. A folder is never overwritten, and nothing is written into one of data.
 
     The path lies in a new folder of a random name that only its owner may enter: nobody can have put a link to
     another file in its place. A link at `path` itself is replaced, not followed. What the system says against writing
@@ -64,6 +64,7 @@ def whole_folder(path: str | os.PathLike[str], mark: str, overwrite: bool = Fals
 
 def free_folder(target: Path, mark: str, overwrite: bool) -> None:
     """Raise `InputError` where `whole_folder` would."""
+    _demand_outside(target)
     if not os.path.lexists(target):
         return
     if target.is_symlink() or not (target / mark).is_file():
@@ -76,9 +77,16 @@ def free_file(target: Path, overwrite: bool) -> None:
     """Raise `InputError` where `whole_file` would."""
     if "\0" in str(target):
         raise InputError(f"{str(target)!r}: a name of a file holds no null byte")
+    _demand_outside(target)
     if os.path.lexists(target) and (not overwrite or (target.is_dir() and not target.is_symlink())):
         remedy = "choose another name" if target.is_dir() else "give overwrite=True, or another name"
         raise InputError(f"{target} exists: {remedy}")
+
+
+def _demand_outside(target: Path) -> None:
+    """Raise `InputError` for a place within a folder of data, of which what is written would become a part."""
+    if within := inside_data(target):
+        raise InputError(f"{target}: {within}: choose another place")
 
 
 def write_ecsv(table: Any, path: str | os.PathLike[str], overwrite: bool = False) -> None:

@@ -10,7 +10,6 @@ from instrument.errors import FileError, InputError
 from instrument.files.by_rows import RowFile
 from instrument.files.measurement_set import MARK, MeasurementSet
 from instrument.model import Instrument
-from instrument.partial_folders import inside_data
 from instrument.visibilities import Visibilities, VisibilitySet
 
 VERSION_4 = (".zgroup", "zarr.json")  # one of them is in every folder of Zarr
@@ -91,8 +90,6 @@ def demand_free(path: str, overwrite: bool) -> None:
     """Raise `InputError` for what is there already, a place within other data, and a library that is not there."""
     from instrument.whole_file import free_file, free_folder
 
-    if within := inside_data(Path(path)):
-        raise InputError(f"{path}: {within}: choose another place")
     suffix = Path(path).suffix.lower()
     if suffix in UV:
         from instrument.files.uv_data import library

@@ -10,6 +10,7 @@ from instrument import MeasurementSet, Observation, Scene
 from instrument.cli import main
 from instrument.errors import InputError
 from instrument.pipeline.folder import RunFolder
+from instrument.units import Direction
 
 SCENE = """name = "night"
 [instrument]
@@ -127,3 +128,15 @@ def test_force_removes_no_folder_that_holds_what_is_read_or_written(made, here, 
     (here / "s.toml").write_text(SCENE + OBSERVATION)
     assert main(["run", "s.toml", "--no-verify", *force]) == 0  # nothing of this scene lies there
     assert not (here / "old" / "sky.csv").exists()
+
+
+@pytest.mark.parametrize("name", ["a.MS/sky.skymodel", "a.MS/HISTORY/deep.ecsv", "link/sky.csv"])
+def test_no_writer_of_files_writes_into_a_folder_of_data(made, here, name):
+    """Not even a sky or a table by Python: a copy of the set would hold it, and its next whole write remove it."""
+    shutil.copytree(made, here / "a.MS")
+    (here / "link").symlink_to("a.MS")
+    sky = instrument.load("skies", "grid", shape=(1, 2), spacing=1 * u.deg, flux=5 * u.Jy).about(Direction(2.15, 0.84))
+    before = tree(here)
+    with pytest.raises(InputError, match=r"it lies in (a.MS|HISTORY), a Measurement Set: choose another place"):
+        sky.write(here / name)
+    assert tree(here) == before
