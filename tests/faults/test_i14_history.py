@@ -5,14 +5,12 @@ import time
 
 import numpy as np
 import pytest
-from astropy import units as u
 
 import instrument
-from instrument import MeasurementSet, Observation, Visibilities
+from instrument import MeasurementSet
 from instrument.cli import main
 from instrument.errors import InstrumentWarning
 from instrument.files import ms_history, ms_write
-from instrument.observe.sampling import Sampling
 
 arrow = pytest.importorskip("arcae.lib.arrow_tables")
 SCENE = """name = "night"
@@ -27,26 +25,9 @@ flux = "5 Jy"
 """
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """A set of two times and three stations."""
-    folder = tmp_path_factory.mktemp("made")
-    lofar = instrument.load("telescopes", "lofar-hba", stations=("CS001HBA0", "CS002HBA1", "RS106HBA"), beam=None)
-    night = Observation(
-        phase_centre="08h13m36.0s +48d13m03s", transit="2012-12-07", duration=20 * u.s, interval=10 * u.s,
-        frequencies=[150.0] * u.MHz, channel_width=0.2 * u.MHz,
-    )  # fmt: skip
-    layout, centre = lofar.layout(), night.phase_centre
-    at = Sampling.build(layout, night.times(layout), night.freq_hz, centre.ra_rad, centre.dec_rad, centre)
-    one, two = layout.baselines
-    vis = Visibilities(np.ones((2, 1, len(one), 2, 2), complex), at, one, two, 10.0, 0.2e6)
-    MeasurementSet.create(folder / "a.MS", vis, instrument=lofar)
-    return folder
-
-
 @pytest.fixture
-def one(made, tmp_path):
-    shutil.copytree(made / "a.MS", tmp_path / "a.MS")
+def one(small_set, tmp_path):
+    shutil.copytree(small_set, tmp_path / "a.MS")
     (tmp_path / "s.toml").write_text(SCENE)
     return tmp_path / "a.MS"
 

@@ -6,7 +6,6 @@ import pytest
 from astropy import units as u
 
 import instrument
-from instrument import MeasurementSet, Observation, Scene
 from instrument.cli import main
 from instrument.errors import InputError
 from instrument.pipeline.folder import RunFolder
@@ -15,7 +14,7 @@ from instrument.units import Direction
 SCENE = """name = "night"
 [instrument]
 telescope = "lofar-hba"
-stations = ["CS001HBA0", "CS002HBA1"]
+stations = ["CS001HBA0", "CS002HBA1", "CS003HBA0"]
 beam = "none"
 [sky]
 kind = "grid"
@@ -31,20 +30,6 @@ interval = "10 s"
 frequency = { centre = "150 MHz", channel_width = "0.2 MHz", channels = 1 }
 """
 RUN = '{"versions": {}}'  # the record by which a folder is known as that of a run
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    pytest.importorskip("arcae")
-    lofar = instrument.load("telescopes", "lofar-hba", stations=("CS001HBA0", "CS002HBA1"), beam=None)
-    night = Observation(
-        phase_centre="08h13m36.0s +48d13m03s", transit="2012-12-07", duration=20 * u.s, interval=10 * u.s,
-        frequencies=[150.0] * u.MHz, channel_width=0.2 * u.MHz,
-    )  # fmt: skip
-    sky = instrument.load("skies", "grid", shape=(1, 2), spacing=1 * u.deg, flux=5 * u.Jy).about(night.phase_centre)
-    path = tmp_path_factory.mktemp("made") / "a.MS"
-    MeasurementSet.create(path, Scene(instrument=lofar, sky=sky, observation=night).plan().run(), instrument=lofar)
-    return path
 
 
 @pytest.fixture
@@ -66,8 +51,8 @@ def refused(capsys, words, line):
 
 @pytest.mark.parametrize("out", ["a.MS/run", "a.MS/deep/er/run", "link/run", "a.MS/HISTORY/run"])
 @pytest.mark.parametrize("verb", ["predict", "subtract"])
-def test_out_in_the_set_that_is_read_is_refused_and_the_set_stays(made, here, capsys, verb, out):
-    shutil.copytree(made, here / "a.MS")
+def test_out_in_the_set_that_is_read_is_refused_and_the_set_stays(small_set, here, capsys, verb, out):
+    shutil.copytree(small_set, here / "a.MS")
     (here / "link").symlink_to("a.MS")
     before = tree(here)
     what = "HISTORY" if "HISTORY" in out else "a.MS"
@@ -76,8 +61,8 @@ def test_out_in_the_set_that_is_read_is_refused_and_the_set_stays(made, here, ca
     assert tree(here) == before
 
 
-def test_the_usual_folder_is_refused_where_the_set_is_the_place_one_works_in(made, here, capsys, monkeypatch):
-    shutil.copytree(made, here / "a.MS")
+def test_the_usual_folder_is_refused_where_the_set_is_the_place_one_works_in(small_set, here, capsys, monkeypatch):
+    shutil.copytree(small_set, here / "a.MS")
     monkeypatch.chdir(here / "a.MS")
     refused(capsys, ["predict", "../s.toml", "--data", "."], "it lies in a.MS, a Measurement Set; choose another")
     assert not (here / "a.MS" / "runs").exists()
@@ -101,18 +86,18 @@ def test_out_in_the_set_that_is_written_is_refused_before_the_work(here, capsys)
     assert not (here / "new.MS").exists()
 
 
-def test_a_new_set_within_another_is_refused(made, here, capsys):
-    shutil.copytree(made, here / "a.MS")
+def test_a_new_set_within_another_is_refused(small_set, here, capsys):
+    shutil.copytree(small_set, here / "a.MS")
     before = tree(here)
     words = ["predict", "s.toml", "--data", "a.MS", "--out", "run", "--into", "a.MS/b.MS"]
     refused(capsys, words, "a.MS/b.MS: it lies in a.MS, a Measurement Set: choose another place")
     assert tree(here) == before
 
 
-def test_force_removes_no_folder_that_holds_what_is_read_or_written(made, here, capsys):
+def test_force_removes_no_folder_that_holds_what_is_read_or_written(small_set, here, capsys):
     (here / "old").mkdir()
     (here / "old" / "run.json").write_text(RUN)
-    shutil.copytree(made, here / "old" / "a.MS")
+    shutil.copytree(small_set, here / "old" / "a.MS")
     (here / "old" / "sky.csv").write_text("ra_deg,dec_deg,i_jy\n123.4,48.2,1\n")
     before = tree(here)
     force = ["--out", "old", "--force"]
@@ -131,9 +116,9 @@ def test_force_removes_no_folder_that_holds_what_is_read_or_written(made, here, 
 
 
 @pytest.mark.parametrize("name", ["a.MS/sky.skymodel", "a.MS/HISTORY/deep.ecsv", "link/sky.csv"])
-def test_no_writer_of_files_writes_into_a_folder_of_data(made, here, name):
+def test_no_writer_of_files_writes_into_a_folder_of_data(small_set, here, name):
     """Not even a sky or a table by Python: a copy of the set would hold it, and its next whole write remove it."""
-    shutil.copytree(made, here / "a.MS")
+    shutil.copytree(small_set, here / "a.MS")
     (here / "link").symlink_to("a.MS")
     sky = instrument.load("skies", "grid", shape=(1, 2), spacing=1 * u.deg, flux=5 * u.Jy).about(Direction(2.15, 0.84))
     before = tree(here)

@@ -1,12 +1,11 @@
 """`instrument plan SCENE --data`: what a verb would print before it computes; nothing is written, nothing else done."""
 
 import re
+import shutil
 
 import pytest
-from astropy import units as u
 
-import instrument
-from instrument import MeasurementSet, Observation, Scene, write_uv
+from instrument import MeasurementSet, write_uv
 from instrument.cli import main
 
 pytest.importorskip("arcae")
@@ -28,17 +27,10 @@ CALIBRATE = '[calibrate]\nkind = "selfcal"\n'
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
+def made(small_set, tmp_path_factory):
     """A folder with a set of two times and three stations, and scenes."""
     folder = tmp_path_factory.mktemp("made")
-    lofar = instrument.load("telescopes", "lofar-hba", stations=("CS001HBA0", "CS002HBA1", "CS003HBA0"), beam=None)
-    night = Observation(
-        phase_centre="08h13m36.0s +48d13m03s", transit="2012-12-07", duration=20 * u.s, interval=10 * u.s,
-        frequencies=[150.0] * u.MHz, channel_width=0.2 * u.MHz,
-    )  # fmt: skip
-    sky = instrument.load("skies", "grid", shape=(1, 2), spacing=1 * u.deg, flux=5 * u.Jy).about(night.phase_centre)
-    vis = Scene(instrument=lofar, sky=sky, observation=night).plan().run()
-    MeasurementSet.create(folder / "a.MS", vis, instrument=lofar)
+    shutil.copytree(small_set, folder / "a.MS")
     (folder / "s.toml").write_text(SCENE)
     (folder / "c.toml").write_text(SCENE + CALIBRATE)
     return folder
