@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -12,20 +12,9 @@ from instrument.checked import checked
 from instrument.errors import InputError
 from instrument.observe.directions import EARTH_RATE, EarthFrame, earth_frame, lmn, tangents
 from instrument.observe.layout import Layout
+from instrument.observe.rising import Rising, rising, rising_seen
 from instrument.shown import short_repr
 from instrument.units import Direction, Float, Int, instants, plain, unit_vectors
-
-
-class Rising(NamedTuple):
-    """Extremes of each direction over all times and stations, (S,): of the sine of its elevation and of its distance.
-
-    `zenith` is its least distance from a zenith or nadir and `horizon` its least from an antenna plane, as sines.
-    """
-
-    highest: Float
-    lowest: Float
-    zenith: Float
-    horizon: Float
 
 
 @dataclass(frozen=True)
@@ -216,27 +205,10 @@ class Sampling:
     @cached_property
     def rising(self) -> Rising:
         """How high and how low each direction stands, and how near it comes to zenith and horizon; never (T, A, S)."""
-        count = len(self.ra_rad)
-        found = Rising(np.full(count, -1.0), np.full(count, 1.0), np.full(count, 1.0), np.full(count, 1.0))
-        first, _ = self.layout.frames
-        step = max(1, int(4e6 / (count * len(first))))  # 32 MB
-        for t in range(0, len(self.earth), step):
-            part = self.block(slice(t, t + step), slice(0, 1)).one_per_frame()
-            axes = part.layout.axes
-            whole = part.seen is None  # or another program has seen them
-            up = part.earth.sines(part.vectors, axes[:, 2]) if whole else np.swapaxes(part.itrf @ axes[:, 2].T, 0, 1)
-            np.maximum(found.highest, up.max(axis=(1, 2)), out=found.highest)
-            np.minimum(found.lowest, up.min(axis=(1, 2)), out=found.lowest)
-            up = np.abs(up)
-            np.minimum(found.horizon, up.min(axis=(1, 2)), out=found.horizon)
-            near = np.sqrt(np.maximum(1.0 - up.max(axis=(1, 2)) ** 2, 0.0))
-            for s in np.flatnonzero(near < 1e-3):  # 1 - up^2 has lost 6 digits there, and all of them at the zenith
-                k, g = np.nonzero(up[s] > 1 - 1e-6)
-                one = part.some(k).towards(self.ra_rad[s : s + 1], self.dec_rad[s : s + 1])
-                there = one.itrf[:, 0] if whole else part.itrf[k, s]
-                near[s] = np.hypot(*np.einsum("nic,nc->in", axes[g, :2], there)).min()
-            np.minimum(found.zenith, near, out=found.zenith)
-        return found
+        normals = self.layout.axes[self.layout.frames[0], 2]
+        if self.seen is None:
+            return rising(self.earth, self.slots_s, self.vectors, normals)
+        return rising_seen(self.seen, normals)  # by another program
 
     @property
     def azimuth(self) -> Float:
