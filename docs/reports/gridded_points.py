@@ -64,7 +64,8 @@ def row(count):
     wrong = (seen.data[few] - due)[good]
     rms = float(np.sqrt(np.mean(np.abs(due[good]) ** 2)))
     return (
-        f"| {count:.0e} | {decided:.1f} | {wall * share:.0f} | {cpu * share:.0f} | {Matrix().work(problem).seconds:.0f} "
+        f"| {count:.0e} | {decided:.1f} "
+        f"| {wall * share:.0f} | {cpu * share:.0f} | {Matrix().work(problem).seconds:.0f} "
         f"| {len(ready.nodes)} | {prepared:.1f} | {gridded:.1f} | {gridded_cpu:.1f} | {ready.work().seconds:.1f} "
         f"| {ready.bound:.1e} | {np.abs(wrong).max() / plan.scale_jy:.1e} "
         f"| {np.sqrt(np.mean(np.abs(wrong) ** 2)) / rms:.1e} |"
@@ -85,10 +86,12 @@ def main():
     head = [
         "# Very many points: gridded, and summed", "", f"`python docs/reports/gridded_points.py`, "
         f"{time.strftime('%Y-%m-%d')}, {versions}.", *__doc__.strip().splitlines()[4:], "",
-        "Seconds to plan (an engine chosen, whatever it needs prepared), and of sums (engine `matrix`): wall, all cores, and as planned; of `gridded`: to prepare, then wall, all "
-        "cores and as planned. Errors: the bound and the largest, of the total flux; rms, of that of the visibilities.",
+        "Seconds to plan (with what the engine chosen needs prepared), and of sums (engine `matrix`): wall, all cores, "
+        "and as planned; of `gridded`: to prepare, then wall, all cores and as planned. Errors: the bound and the "
+        "largest, of the total flux; rms, of that of the visibilities.",
         "",
-        "| sources | to plan | summed | cores | planned | nodes | prepared | gridded | cores | planned | bound | largest | rms |",
+        "| sources | to plan | summed | cores "
+        " | planned | nodes | prepared | gridded | cores | planned | bound | largest | rms |",
         "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]  # fmt: skip
     (given.out / "gridded_points.md").write_text("\n".join([*head, *lines]) + "\n")
