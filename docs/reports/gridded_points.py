@@ -90,7 +90,7 @@ def main():
         "and as planned; of `gridded`: to prepare, then wall, all cores and as planned. Errors: the bound and the "
         "largest, of the total flux; rms, of that of the visibilities.",
         "",
-        "| sources | to plan | summed | cores "
+        "| sources | to plan | summed | cores"
         " | planned | nodes | prepared | gridded | cores | planned | bound | largest | rms |",
         "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]  # fmt: skip
