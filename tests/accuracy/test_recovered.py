@@ -24,6 +24,7 @@ from instrument import (
 )
 from instrument.analyze.power.signal_sky import SignalSky
 from instrument.analyze.power.transform import Transform
+from instrument.observe.sampling import Sampling
 from instrument.pipeline.run import run
 from instrument.pipeline.scene_file import parse
 from instrument.sky.synchrotron import Synchrotron
@@ -76,6 +77,63 @@ def test_the_scatter_that_is_said_is_that_over_many_foregrounds_and_noises():
         pull = (np.mean(values, axis=0) - due) / (expected / np.sqrt(40))
         assert np.abs(pull).max() < 4
         assert np.std(values, axis=0, ddof=1) / expected == pytest.approx(np.ones(4), abs=0.35)
+
+
+def seen(cube, coverage):
+    """A cube of which an array sees each cell (u, v) with some weight."""
+    plane = np.fft.ifft2(np.fft.fft2(cube.data, axes=(2, 3)) * coverage, axes=(2, 3)).real
+    return cube.with_data(plane)
+
+
+@pytest.mark.parametrize("taper_space", [None, "hann"])
+@pytest.mark.parametrize("filled", [0.08, 0.3])
+def test_the_scatter_is_that_of_the_cells_that_few_baselines_leave(filled, taper_space):
+    """60 foregrounds and noises through 8 and 30 % of the cells; by the number of cells it is 1.4 to 4.5 times less.
+
+    The two upper bins: the lower ones have one or two modes, of which the transfer that is found takes half a mode.
+    """
+    rng = np.random.default_rng(3)
+    shape = (12, 32, 32)
+    coverage = np.where(rng.random(shape[1:]) < filled / 2, rng.uniform(0.3, 3, shape[1:]), 0.0)
+    coverage = coverage + np.roll(coverage[::-1, ::-1], (1, 1), (0, 1))  # both signs
+    signal = seen(white(1, shape=shape), coverage)
+    ratios, transfers, said, plain = [], [], [], []
+    how = Transform(taper_space=taper_space)
+    for seed in range(60):
+        noise, same = (seen(white(k + seed, 0.6, shape), coverage).data for k in (500, 900))
+        total = signal.with_data(0.8 * signal.data + seen(white(100 + seed, 1.7, shape), coverage).data + noise)
+        found = recovered_power(total, signal, noise=signal.with_data(same), how=how, bins=4)
+        ratios.append(found.ratio), transfers.append(found.transfer)
+        said.append((found.ratio_sigma, found.transfer_sigma))
+        modes = (found.injected.power / found.injected.sigma) ** 2
+        plain.append(np.sqrt((found.foreign**2 + 2 * found.transfer**2 * found.foreign) / modes))
+    sigma = np.sqrt(np.mean(np.square(said), axis=0))
+    pulls = (np.array([np.std(x, axis=0, ddof=1) for x in (ratios, transfers)]) / sigma)[:, 2:]
+    np.testing.assert_allclose(pulls, 1, atol=0.3)  # 60 draws tell each to 9 %
+    assert np.all(np.std(ratios, axis=0, ddof=1)[2:] > 1.3 * np.mean(plain, axis=0)[2:])
+
+
+def test_natural_weights_make_the_scatter_of_a_spectrum_larger_than_even_ones():
+    """What docs/spectra.md says: 59 LOFAR stations, 8 h, 480 pixels of 0.5 arcmin, bins of a third in uv."""
+    layout = instrument.load("telescopes", "lofar-hba").layout()
+    night = Observation(
+        phase_centre="08h13m36.0s +48d13m03s", transit="2012-12-07", duration=8 * u.hour, interval=60 * u.s,
+        frequencies=[150.0] * u.MHz, channel_width=0.2 * u.MHz,
+    )  # fmt: skip
+    centre = night.phase_centre
+    at = Sampling.build(layout, night.times(layout), night.freq_hz, centre.ra_rad, centre.dec_rad, centre)
+    one, two = layout.baselines
+    uv = (at.uvw_m[:, one] - at.uvw_m[:, two])[..., :2].reshape(-1, 2) * 150e6 / 299792458.0
+    cell, side = 1 / np.deg2rad(480 * 0.5 / 60), 125
+    weight = np.histogram2d(*uv.T, bins=side, range=[[-side / 2 * cell, side / 2 * cell]] * 2)[0]
+    place = (np.arange(side) - side // 2) * cell
+    distance, weight = np.hypot(place[:, None], place), weight + weight[::-1, ::-1]
+    larger = {1: [], 2: []}
+    for low in np.geomspace(30, 800, 13)[:-1]:
+        there = weight[(distance >= low) & (distance < low * 1.315)]
+        for power, found in larger.items():  # noise goes by the weights, the sky by their squares
+            found.append(np.sqrt(len(there) * (there ** (2 * power)).sum()) / (there**power).sum())
+    assert max(larger[2]) == pytest.approx(1.35, abs=0.03) and max(larger[1]) == pytest.approx(1.1, abs=0.03)
 
 
 def test_tables_are_written_and_cubes_that_do_not_fit_are_refused(tmp_path):

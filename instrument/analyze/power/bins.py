@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,3 +60,10 @@ class Plane:
             part = slice(bounds[0], bounds[-1])
             out[filled] = np.add.reduceat(row[part] * self.times[part], bounds[:-1][filled] - bounds[0])
         return out
+
+    def sums_of(self, bounds: Int, delay: int, of: Callable[[int, slice], Float]) -> Float:
+        """The same of what a delay, by its index, has in the cells of all bins."""
+        part = slice(bounds[0], bounds[-1])
+        values = np.zeros(len(self.k_perp))
+        values[part] = of(delay, part)
+        return self.sums(bounds, values)

@@ -63,7 +63,8 @@ class Cylindrical(_Spectrum):
 
     `k_perp` and `k_par` (1/Mpc) are means over the cells of a bin `edges[i] <= k < edges[i+1]`, the last one closed;
     `count` is their number, both signs of every k counted, and NaN stands where it is 0. `sigma` is the scatter of a
-    Gaussian field: power over the root of the independent modes. `left_out` counts the cells in no bin.
+    Gaussian field that all cells see alike: power over the root of the independent modes. `left_out` counts the cells
+    in no bin.
     """
 
     k_perp: Float
@@ -101,15 +102,15 @@ class Cylindrical(_Spectrum):
 
         At the mean k of a bin a steep spectrum is another, by 2 to 7 % for bins of ratio 1.37.
         """
-        cells = self.cells
+        return self.mean(lambda m, part: model(np.hypot(self.cells.k_perp[part], self.cells.k_par[m])))
+
+    def mean(self, of: Callable[[int, slice], Float]) -> Float:
+        """Mean over the cells of each bin (P, L) of what a delay, by its index, has in some cells (u, v)."""
+        cells, sums = self.cells, np.zeros(self.power.shape)
         bounds, rows = bounds_of(cells.k_perp, self.perp_edges), rows_of(cells.k_par, self.par_edges)
-        sums = np.zeros(self.power.shape)
-        for row, k_par, fold in zip(rows, cells.k_par, cells.folds, strict=True):
+        for m, (row, fold) in enumerate(zip(rows, cells.folds, strict=True)):
             if row >= 0:
-                part = slice(bounds[0], bounds[-1])
-                values = np.zeros(len(cells.k_perp))
-                values[part] = model(np.hypot(cells.k_perp[part], k_par))
-                sums[:, row] += fold * cells.sums(bounds, values)
+                sums[:, row] += fold * cells.sums_of(bounds, m, of)
         return divided(sums, self.count)
 
     def table(self) -> Any:
@@ -158,12 +159,13 @@ class Spherical(_Spectrum):
 
     def average(self, model: Callable[[Float], Float]) -> Float:
         """Mean of a spectrum P(k) over the cells of each bin (N,); see `Cylindrical.average`."""
+        return self.mean(lambda m, part: model(np.hypot(self.cells.k_perp[part], self.cells.k_par[m])))
+
+    def mean(self, of: Callable[[int, slice], Float]) -> Float:
+        """The same as `Cylindrical.mean` (N,)."""
         cells, sums = self.cells, np.zeros(len(self.k))
-        for bounds, k_par, fold in zip(self.bounds, cells.k_par, cells.folds, strict=True):
-            part = slice(bounds[0], bounds[-1])
-            values = np.zeros(len(cells.k_perp))
-            values[part] = model(np.hypot(cells.k_perp[part], k_par))
-            sums += fold * cells.sums(bounds, values)
+        for m, (bounds, fold) in enumerate(zip(self.bounds, cells.folds, strict=True)):
+            sums += fold * cells.sums_of(bounds, m, of)
         return divided(sums, self.count)
 
     def table(self) -> Any:
