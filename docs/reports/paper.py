@@ -101,34 +101,15 @@ def deviations():
 
 
 def findings(folder, name):
-    """The findings of an experiment in the folder of a run; of a run before limits were kept, as they are told now."""
+    """The findings of an experiment in the folder of a run."""
     table = Table.read(folder / f"{name}.ecsv")
     found = []
     for line in table.filled("") if table.has_masked_columns else table:
         low, high = float(line["low"]), float(line["high"])
-        given = {key: str(line[key]) for key in ("what", "unit", "paper", "because", "since")}
-        given |= {key: str(line[key]) for key in ("end", "kept") if key in table.colnames}
+        given = {key: str(line[key]) for key in ("what", "unit", "paper", "because", "since", "end", "kept")}
         given |= {"within": None if np.isnan(low) else (low, high), "slip": bool(line["slip"])}
         found.append(Finding(**given, ours=float(line["ours"]), changed=float(line["changed"])))
-    return found if "end" in table.colnames else [_renewed(folder, f) for f in found]
-
-
-def _renewed(folder, f):
-    """A finding of a run whose tables have no `end` and `kept`: both out of numbers of the same run."""
-    numbers = record(folder)["numbers"]["errata"]
-    nyquist = numbers["7. largest k_par of channels of 0.2 MHz"]
-    # the largest k of baselines up to 800 wavelengths in these channels
-    largest = np.hypot(nyquist, 2 * np.pi * 800 / numbers["8. comoving distance at z = 8.47"])
-    spherical = "k up to which the spherical leakage is below the signal"
-    if f.what.startswith("13. ") and f.slip:
-        return f._replace(kept="the mock field follows the paper")
-    if f.what in (spherical, "the same without noise in Q and U") and f.ours > 0.999 * largest:
-        name = f"{f.what}, field of 4 deg" if f.what == spherical else f.what
-        return f._replace(what=name, end=f"all k measured, {f.ours:.3g} /Mpc is the largest")
-    if f.unit == "/Mpc" and not f.slip and f.ours >= nyquist * (1 - 1e-9):
-        low = f.within and (f.within[0], np.inf)
-        return f._replace(within=low, end=f"all k_par measured, {nyquist:.3g} /Mpc is Nyquist")
-    return f
+    return found
 
 
 MEANS = {  # what is not reproduced, by the beginning of its name
