@@ -8,6 +8,7 @@ visibilities and less, each of which is read once.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,15 @@ from instrument.compiled import compiled
 from instrument.image.clock import Clock, ever_within, turns
 from instrument.observe.directions import LIGHT
 from instrument.predict.base import Problem
-from instrument.predict.time_samples import TimeSamples, growth, kernels, steps, taps_for, time_samples, with_skirts
+from instrument.predict.time_samples import (
+    TimeSamples,
+    growth,
+    kernels,
+    steps,
+    taps_for,
+    time_samples,
+    with_skirts,
+)
 from instrument.units import Bool, Complex, Float, Int
 
 FEW = 48  # integrations up to which visibilities are gridded as they are
@@ -24,6 +33,7 @@ BETWEEN = 0.4  # of the accuracy, for interpolation
 SURE = 1.5  # ducc0's error of one visibility over the one that it is asked for: 1.04 at most was found
 COLUMNS = 10  # real and imaginary parts of I, Q, U, V; weights of I and of U
 SAMPLE = 8.0 * COLUMNS  # bytes
+TOGETHER = 128  # baselines whose sums are held at once, until all integrations that share samples are in them
 PAYS = 0.5  # samples in place of as many visibilities, at most
 
 
@@ -49,6 +59,12 @@ def regular(problem: Problem) -> bool:
     at = problem.at
     apart = at.own_uvw_m is not None or at.seen_centre is not None
     return not apart and len(at.slots_s) > FEW and bool(np.ptp(np.diff(at.slots_s)) <= 1e-5)
+
+
+@cache
+def _wide(taps: int) -> Float:
+    """The kernels of all steps, and zeros up to the next sixteen taps (steps, longest step, wide)."""
+    return np.pad(kernels(taps), ((0, 0), (0, 0), (0, -taps % 16)))
 
 
 @dataclass(frozen=True)
@@ -107,9 +123,10 @@ class Span:
         _gather(
             (np.ascontiguousarray(data).view(float).reshape(*data.shape[:2], 8), weight, flag, numbers - self.first),
             (uv, one, other, np.array([low, high])),
-            (samples.rows, samples.step, samples.offset, kernels(samples.taps)),
+            (samples.rows, samples.step, samples.offset, _wide(samples.taps), samples.taps),
             self.last - self.first,
             (self.sums, self.weight),
+            np.zeros((TOGETHER, COLUMNS, _wide(samples.taps).shape[2])),
         )
 
     def gridded(self) -> tuple[Float, list[Complex], float]:
@@ -131,54 +148,85 @@ class Span:
 
 # infinities and NaN are looked for
 @compiled(nogil=True, fastmath={"contract", "nsz"}, error_model="numpy")
-def _gather(given: Any, seen: Any, comb: Any, count: Any, sums: Any) -> None:
+def _gather(given: Any, seen: Any, comb: Any, count: Any, sums: Any, held: Any) -> None:
+    """Add visibilities to samples: some baselines after the other, their sums in the cache until they are whole."""
     (data, weight, flag, when), (uv, one, other, limits) = given, seen
-    (rows, step, offset, kernels), (out, total) = comb, sums
-    taps, apart = kernels.shape[2], weight.shape[2] > 1
-    row = np.zeros(10)
+    (rows, step, offset, kernels, taps), (out, total) = comb, sums
+    apart, row, at = weight.shape[2] > 1, np.zeros(10), np.zeros(held.shape[0], np.int64)
     low, high = limits[0] ** 2, limits[1] ** 2
-    for t in range(data.shape[0]):
-        after = when[t]
-        if after < 0 or after >= count:
-            continue
-        for n in range(len(rows)):
-            b = rows[n]
-            u, v = uv[t, one[b], 0] - uv[t, other[b], 0], uv[t, one[b], 1] - uv[t, other[b], 1]
-            length = u * u + v * v
-            if flag[t, b] or length < low or length > high:
+    for some in range(0, len(rows), len(held)):
+        last = min(some + len(held), len(rows))
+        at[:] = -1
+        for t in range(data.shape[0]):
+            after = when[t]
+            if after < 0 or after >= count:
                 continue
-            x = data[t, b]
-            parallel, crossed = weight[t, b, 0], weight[t, b, 2 if apart else 0]
-            wrong = 0.0
-            if not apart:
-                for c in range(8):
-                    wrong += x[c] * 0.0
-            if wrong != 0.0 or (parallel == 0.0 and crossed == 0.0):
-                continue
-            for c in range(8):
-                row[c] = 0.0
-            half = 0.5 * parallel
-            if parallel > 0.0:
-                row[0], row[1], row[2], row[3] = x[0] + x[6], x[1] + x[7], x[0] - x[6], x[1] - x[7]
-                for c in range(4):
-                    row[c] *= half
-            half = 0.5 * crossed
-            if crossed > 0.0:
-                row[4], row[5], row[6], row[7] = x[2] + x[4], x[3] + x[5], x[3] - x[5], x[4] - x[2]
-                for c in range(4, 8):
-                    row[c] *= half
-            row[8], row[9] = parallel, crossed
-            total[0] += parallel
-            total[1] += crossed
-            if step[n] == 1:
-                to = out[offset[n] + after]
-                for c in range(10):
-                    to[c] += row[c]
-                continue
-            first = after // step[n]
-            weights = kernels[step[n], after - first * step[n]]
-            begin = offset[n] + first
-            for q in range(taps):
-                w = weights[q]
-                for c in range(10):
-                    out[begin + q, c] += w * row[c]
+            for n in range(some, last):
+                b, k = rows[n], n - some
+                u, v = uv[t, one[b], 0] - uv[t, other[b], 0], uv[t, one[b], 1] - uv[t, other[b], 1]
+                length = u * u + v * v
+                if flag[t, b] or length < low or length > high:
+                    continue
+                parallel, crossed = weight[t, b, 0], weight[t, b, 2 if apart else 0]
+                if not _weighted(data[t, b], parallel, crossed, apart, row):
+                    continue
+                total[0] += parallel
+                total[1] += crossed
+                if step[n] == 1:
+                    to = out[offset[n] + after]
+                    for c in range(10):
+                        to[c] += row[c]
+                    continue
+                first = after // step[n]
+                if at[k] != first:
+                    if at[k] >= 0:
+                        _flush(held[k], out[offset[n] + at[k] : offset[n] + at[k] + taps])
+                    at[k] = first
+                _hold(held[k], kernels[step[n], after - first * step[n]], row)
+        for n in range(some, last):
+            if at[n - some] >= 0:
+                first = offset[n] + at[n - some]
+                _flush(held[n - some], out[first : first + taps])
+
+
+@compiled(nogil=True, fastmath={"contract", "nsz"}, error_model="numpy")
+def _weighted(x: Any, parallel: Any, crossed: Any, apart: Any, row: Any) -> Any:
+    """Fill in w I, w Q, w U, w V and the weights (10,) of one visibility (8,); whether it counts."""
+    wrong = 0.0
+    if not apart:
+        for c in range(8):
+            wrong += x[c] * 0.0
+    if wrong != 0.0 or (parallel == 0.0 and crossed == 0.0):
+        return False
+    for c in range(8):
+        row[c] = 0.0
+    half = 0.5 * parallel
+    if parallel > 0.0:
+        row[0], row[1], row[2], row[3] = x[0] + x[6], x[1] + x[7], x[0] - x[6], x[1] - x[7]
+        for c in range(4):
+            row[c] *= half
+    half = 0.5 * crossed
+    if crossed > 0.0:
+        row[4], row[5], row[6], row[7] = x[2] + x[4], x[3] + x[5], x[3] - x[5], x[4] - x[2]
+        for c in range(4, 8):
+            row[c] *= half
+    row[8], row[9] = parallel, crossed
+    return True
+
+
+@compiled(nogil=True, fastmath={"contract", "nsz"}, error_model="numpy")
+def _hold(held: Any, weights: Any, row: Any) -> None:
+    """Add a visibility (10,) to all samples that it is part of (10, wide): loops of sixteen are worked out together."""
+    for c in range(10):
+        value = row[c]
+        for q in range(held.shape[1]):
+            held[c, q] += weights[q] * value
+
+
+@compiled(nogil=True, fastmath={"contract", "nsz"}, error_model="numpy")
+def _flush(held: Any, out: Any) -> None:
+    """Put what is held (10, wide) to its samples (taps, 10), and hold nothing."""
+    for q in range(out.shape[0]):
+        for c in range(10):
+            out[q, c] += held[c, q]
+    held[:] = 0.0
