@@ -124,8 +124,8 @@ def _fewer(full: Problem, sky: PointSky, budget: Budget, left_out: list[Item]) -
             use &= ~faint
     if use.all():
         return replace(full, chain=chain)
-    smaller = sky.select(np.flatnonzero(use))
-    return replace(full, chain=chain, sky=smaller, at=full.at.towards(*smaller.directions()))
+    kept = np.flatnonzero(use)
+    return replace(full, chain=chain, sky=sky.select(kept), at=full.at.of(kept))
 
 
 def _faint(stokes: Float, use: Bool, peak: float, tolerance: float) -> tuple[Bool, float]:

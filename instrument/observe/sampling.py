@@ -137,6 +137,19 @@ class Sampling:
         """The same for other directions, ICRS rad (S,)."""
         return replace(self, ra_rad=np.atleast_1d(ra_rad), dec_rad=np.atleast_1d(dec_rad), seen=None, seen_east=None)
 
+    def of(self, directions: Int) -> Sampling:
+        """The same for some of its directions, by their indices; what was found of how high they come is kept."""
+        made = replace(
+            self,
+            ra_rad=self.ra_rad[directions],
+            dec_rad=self.dec_rad[directions],
+            seen=None if self.seen is None else self.seen[:, directions],
+            seen_east=None if self.seen_east is None else self.seen_east[:, directions],
+        )
+        if "rising" in self.__dict__:
+            made.__dict__["rising"] = Rising(*(x[directions] for x in self.rising))
+        return made
+
     def at_centre(self) -> Sampling:
         """The same for the phase centre alone."""
         return self.towards(np.array([self.centre.ra_rad]), np.array([self.centre.dec_rad]))

@@ -74,6 +74,17 @@ def _counted(found, looked):
     return found
 
 
+def test_some_directions_keep_what_was_found_of_them():
+    at, which = sampling(TIMES["a night"], *sky()), np.array([3, 77, 4])
+    known = at.rising
+    kept = at.of(which)
+    assert "rising" in vars(kept) and "rising" not in vars(sampling(TIMES["one"], *sky()).of(which))
+    fresh = at.towards(at.ra_rad[which], at.dec_rad[which]).rising
+    for one, other, whole in zip(kept.rising, fresh, known, strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-9)
+        assert np.array_equal(one, whole[which])
+
+
 def test_blocks_of_times_and_directions_change_nothing(monkeypatch):
     at = sampling(TIMES["a day, in steps that do not divide it"], *sky())
     whole = at.rising
