@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from instrument.cli_analyze import add_analyze, analyze
-from instrument.errors import InputError, did_you_mean
+from instrument.errors import InputError, did_you_mean, unused_ledger
 from instrument.pipeline.on_data import HELP, WRITES, can, tables_on
 from instrument.provenance import command, commanded
 from instrument.terminal import DONE, FAILED, FELL_SHORT, process, show, status_of
@@ -196,17 +196,18 @@ def _scene_file(given: argparse.Namespace, verb: str = "") -> Any:
 def _run(given: argparse.Namespace) -> int:
     from instrument.pipeline.run import run
 
-    tables, scene_file = _scene_file(given, given.verb)
-    result = run(
-        scene_file,
-        tables,
-        out=given.out,
-        memory=given.memory,
-        workers=given.workers,
-        verify=not given.no_verify,
-        show=show,
-        force=given.force,
-    )
+    with unused_ledger():
+        tables, scene_file = _scene_file(given, given.verb)
+        result = run(
+            scene_file,
+            tables,
+            out=given.out,
+            memory=given.memory,
+            workers=given.workers,
+            verify=not given.no_verify,
+            show=show,
+            force=given.force,
+        )
     return DONE if result.passed else FELL_SHORT
 
 

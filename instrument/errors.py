@@ -81,8 +81,8 @@ def unused(source: str, names: Iterable[str], why: str = "") -> None:
 
 @contextmanager
 def unused_ledger() -> Iterator[dict[str, list[str]]]:
-    """Collects what `unused` says inside, by source: what `run.json` holds under "unused"."""
-    ledger: dict[str, list[str]] = {}
+    """Collects what `unused` says inside, by source, with what one around it has: run.json's "unused"."""
+    ledger = {source: list(names) for source, names in (_LEDGER.get() or {}).items()}
     token = _LEDGER.set(ledger)
     try:
         yield ledger

@@ -42,13 +42,16 @@ def _smearing(problem: Problem) -> list[Item]:
     """Averaging within a channel and an integration."""
     far = float(np.sin(np.minimum(separation(problem.at.vectors, problem.at.centre).max(), np.pi / 2)))
     longest = problem.at.layout.longest_m
+    if problem.uv_range is not None:
+        longest = min(longest, problem.uv_range[1] * LIGHT / float(problem.at.freq_hz.min()))
     parts = []
     turns = EARTH_RATE * problem.interval_s * longest * float(problem.at.freq_hz.max()) / LIGHT * far
     parts.append(f"averaging over {si_prefix(problem.interval_s, 's')} would lose {_percent(1 - np.sinc(turns))}")
     if problem.width_hz:
         lost = 1 - np.sinc(problem.width_hz * longest / LIGHT * far)
         parts.append(f"over {si_prefix(problem.width_hz, 'Hz')} {_percent(lost)}")
-    return [Item("smearing", f"{', '.join(parts)} of the farthest source on the longest baseline")]
+    where = "longest baseline" if problem.uv_range is None else "longest of these baselines"
+    return [Item("smearing", f"{', '.join(parts)} of the farthest source on the {where}: nothing is lost here")]
 
 
 def _percent(lost: float) -> str:

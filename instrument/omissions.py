@@ -20,6 +20,7 @@ from instrument.sky.sums import SumSky
 from instrument.units import Bool, Float
 
 KINDS = ("I", "Q", "U", "V")
+WORTH = 0.01  # of all sources: fewer faint ones save nothing and are no error worth having
 
 
 class Budget:
@@ -118,7 +119,7 @@ def _fewer(full: Problem, sky: PointSky, budget: Budget, left_out: list[Item]) -
         raise InputError("nothing of the sky is ever above the antenna planes, or it has no flux at all")
     if budget.left > 0:
         faint, bound = _faint(stokes, use, chain.peak(full.at), 0.5 * budget.left)
-        if faint.any():
+        if faint.sum() >= WORTH * use.sum():
             budget.take(bound)
             left_out.append(Item(count_of(int(faint.sum()), "faint direction"), "flux times the peak of |J|^2", bound))
             use &= ~faint

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from instrument.errors import InputError
+from instrument.errors import InputError, unused
 
 OWN = ("name", "title", "seed", "tolerance", "engine", "instrument", "sky")
 STAGES = {"predict": (), "calibrate": ("calibrate",), "image": ("correct", "image", "analyze"), "subtract": ()}
@@ -35,10 +35,15 @@ def tables_on(verb: str, tables: dict[str, Any], data: dict[str, Any], into: str
     from instrument.files.formats import ENDINGS, has_columns, known_file, names_file
 
     if not can(verb, tables):
-        raise InputError(f"{verb} takes its settings from a table [{verb}], which the scene has not")
+        raise InputError(
+            f"{verb} takes its settings from a table [{verb}], which the scene has not: write one, as [{verb}] alone"
+            + (' with kind = "selfcal"' if verb == "calibrate" else "")
+        )
     kept = {name: value for name, value in tables.items() if name in (*OWN, *STAGES[verb])}
     if not Path(data["set"]).is_dir():
         known_file(data["set"])
+    if "observation" in tables:
+        unused("scene", ["[observation]"], f"times, channels and stations are those of {data['set']}")
     kept["name"] = f"{tables.get('name', 'scene')}-{verb}"  # or one verb's --force would take the folder of another
     out = kept | {"data": {name: value for name, value in data.items() if value is not None}}
     if verb not in WRITES:

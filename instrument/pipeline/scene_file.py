@@ -83,7 +83,8 @@ class SceneFile(Component):
         """The observation of the table [observation], or that of the data."""
         if (self.data is None) == (self.observation is None):
             said = "[observation] stands beside [data], whose observation is taken: leave one of them out"
-            raise InputError("a scene needs a table [observation]" if self.data is None else said)
+            need = "a scene needs a table [observation], or data: `instrument image SCENE --data x.MS`, or [data]"
+            raise InputError(need if self.data is None else said)
         if self.data is not None:
             with _in_table("data"):
                 return self.data.observation

@@ -71,7 +71,7 @@ class Sources(PlacedSky):
         if self.stokes_jy.shape[1] != 4:
             raise InputError(f"stokes_jy has shape {self.stokes_jy.shape}, needed (sources, 4)")
         if np.any(np.abs(self.dec_rad) > np.pi / 2 + 1e-12):
-            raise InputError("a declination lies beyond the pole")
+            raise InputError("a declination lies beyond the pole: right ascensions and declinations are in rad")
         if self.reference_hz is None and (self.spectral_terms is not None or self.rotation_measure is not None):
             raise InputError("spectral terms and rotation measures need reference_hz")
         if self.rotation_measure is not None and np.any(far := np.abs(self.rotation_measure) > MOST_RM):

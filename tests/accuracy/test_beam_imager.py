@@ -164,7 +164,7 @@ def test_a_run_writes_the_maps_and_shows_them(tmp_path):
     blank = np.isnan(read_cube(tmp_path / "out" / "cube.fits").data[0, 0]).mean()
     assert f"{blank:.0%} of the pixels have none" in page
     assert (tmp_path / "out" / "maps.png").is_file()
-    assert ">How beam ended<" in page and ">without data<" in page
+    assert ">How each channel ended (beam)<" in page and ">without data<" in page
 
 
 def test_sources_between_pixels_are_said():

@@ -201,6 +201,25 @@ def test_work_counts_the_products_that_structure_and_sky_need():
     assert scene(u_too, beam=None).plan().work.flops == pytest.approx(3 * unit + beams + 600 * 48)
 
 
+@pytest.mark.parametrize(("faint", "stays"), [(1, True), (3, False)])
+def test_a_few_faint_sources_stay_for_they_cost_nothing(faint, stays):
+    """One of 201 is all of the error where it is left out, and half a percent of the time where it is not."""
+    rng = np.random.default_rng(5)
+    count = 200 + faint
+    where = CENTRE.spherical_offsets_by(rng.uniform(-3, 3, count) * u.deg, rng.uniform(-3, 3, count) * u.deg)
+    flux = np.where(np.arange(count) < faint, 1e-5, 1.0)[:, None] * np.array([1, 0, 0, 0])
+    plan = scene(PointSky.at(where, flux)).plan(tolerance=1e-4)
+    assert any("faint" in name for name in names(plan.left_out)) != stays
+    assert plan.problem.at.shape[3] == (count if stays else 200)
+
+
+def test_smearing_is_that_of_the_baselines_in_the_uv_range():
+    made = scene(PointSky.at(CENTRE, [[1.0, 0, 0, 0]]))
+    whole, inner = (str(made.plan(uv_range=limits)) for limits in (None, (0, 5000)))
+    assert "on the longest baseline: nothing is lost here" in whole
+    assert "on the longest of these baselines: nothing is lost here" in inner
+
+
 def test_plan_prints_what_a_user_must_know():
     text = str(scene(gain=GainTerm(rms=1e-3, seed=1)).plan(tolerance=1e-5))
     for word in ("6 stations", "15 baselines", "16 times", "1 channel", "40 directions", "tolerance 1e-05",

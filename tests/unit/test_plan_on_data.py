@@ -1,5 +1,6 @@
 """`instrument plan SCENE --data`: what a verb would print before it computes; nothing is written, nothing else done."""
 
+import json
 import re
 import shutil
 
@@ -117,3 +118,17 @@ def test_a_file_without_columns_is_planned_with_the_new_file_that_it_goes_to(mad
     assert "give --into a new file" in capsys.readouterr().err
     assert planned(made, "--for", "subtract", "--into", str(tmp_path / "b.uvh5"), data="a.uvh5") == 0
     assert f"into {tmp_path}/b.uvh5" in capsys.readouterr().out and not (tmp_path / "b.uvh5").exists()
+
+
+def test_the_observation_of_a_scene_is_said_not_to_be_that_of_the_data(made, tmp_path, capsys):
+    """In a line, and in run.json."""
+    observed = '[observation]\nphase_centre = "08h13m36.0s +48d13m03s"\ntransit = "2012-12-07"\nduration = "1 h"\n'
+    observed += 'interval = "2 min"\nfrequency = { centre = "150 MHz", channel_width = "0.2 MHz", channels = 1 }\n'
+    (tmp_path / "o.toml").write_text(SCENE + observed)
+    line = "scene: not used: [observation] (times, channels and stations are those of"
+    assert main(["plan", str(tmp_path / "o.toml"), "--data", str(made / "a.MS"), "--for", "image"]) == 0
+    assert capsys.readouterr().err.count(line) == 1
+    out = tmp_path / "run"
+    assert main(["image", str(tmp_path / "o.toml"), "--data", str(made / "a.MS"), "--out", str(out)]) == 0
+    assert capsys.readouterr().err.count(line) == 1
+    assert json.loads((out / "run.json").read_text())["unused"] == {"scene": ["[observation]"]}

@@ -212,7 +212,7 @@ class ImageResult(StageResult):
 
     def tables(self) -> list[Section]:
         """How every channel ended, where the imager says so."""
-        return [Section(f"How {name} ended", [_table_of(rows)]) for name, rows in self._ended.items()]
+        return [Section(f"How each channel ended ({name})", [_table_of(rows)]) for name, rows in self._ended.items()]
 
     def sections(self, draw: Draw) -> list[Section]:
         """Images of the first, middle and last channel, the PSF, and the rms of each Stokes parameter in them."""
