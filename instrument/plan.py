@@ -262,7 +262,15 @@ class Plan(VisibilitySet):
         """
         from instrument.predict.gridded import image_operator
 
-        return image_operator(self.problem, grid, tolerance)
+        key = grid.pixels, grid.pixel, grid.centre, tolerance
+        if key not in self._operators:
+            self._operators.clear()  # one is held: a run plans with it, and then works with it
+            self._operators[key] = image_operator(self.problem, grid, tolerance)
+        return self._operators[key]
+
+    @cached_property
+    def _operators(self) -> dict[Any, ImageOperator]:
+        return {}
 
     def _checker(self, samples: int, seed: int) -> Checker:
         against = BY_STATIONS if isinstance(self.engine, Direct) else DEFINITION

@@ -22,6 +22,7 @@ from instrument.observe.directions import LIGHT
 from instrument.pipeline.stage import Beside, Draw, Running, Stage, StageResult, StageRun
 from instrument.pipeline.work import Items, StageWork
 from instrument.plan import Item, count_of
+from instrument.predict.operator import ImageOperator
 from instrument.registry import load, names
 from instrument.report.page import Card, Figures, Section, Table, Text, number
 from instrument.scene import Scene
@@ -32,8 +33,6 @@ from instrument.visibilities import Visibilities
 GRIDDING, PICKING = 0.45e-6, 0.3e-6
 TURNING = 4e-7  # seconds of a pixel for each call of the gridder: its transforms
 KEEPING = 2e-6  # seconds of a visibility that is kept in a file, read and imaged
-# of one transform on one core, a pixel; of a visibility in it; nodes of LOFAR's beams over 4 deg at 1e-5
-TURNING_ONE, TAKING, NODES = 6e-8, 2e-7, 42
 GRIDDED = 250.0  # bytes of a visibility while it is gridded
 
 
@@ -89,23 +88,30 @@ class Image(Stage):
         """Empty sums of images, with the weights of this run."""
         if self.imager.through_beams:
             problem = run.plan.problem
-            grid, imager = self.imager.grid(problem.at.centre), self.imager.for_sky(problem.sky, problem.at.centre)
-            return Kept(imager, run.plan.operator(grid, self.imager.operator_tolerance))
+            return Kept(self.imager.for_sky(problem.sky, problem.at.centre), operator_of(self.imager, run))
         return self.imager.start(run.density(self.imager))
+
+
+def operator_of(imager: AnyImager, run: Running) -> ImageOperator:
+    """The operator through the beams of a run that an imager works with."""
+    return run.plan.operator(imager.grid(run.plan.problem.at.centre), imager.operator_tolerance)
 
 
 def imaging(imager: AnyImager, run: Running, count: int = 1) -> StageWork:
     """What `count` sets of images of the visibilities of a run cost."""
     channels, plane = run.plan.problem.shape[1], 8.0 * imager.pixels**2
     if not isinstance(imager, Imager):  # of which only the size is known
-        chosen = run.visibilities * inside(imager.uv_range, run) / channels
-        through = imager.operator_passes * channels * 4 * NODES * (TURNING_ONE * imager.pixels**2 + TAKING * chosen)
+        through, held = 0.0, 0.0
+        if imager.through_beams:
+            operator = operator_of(imager, run).within(imager.uv_range)
+            one = operator.work(channels=slice(0, 1))
+            through, held = imager.operator_passes * channels * one.seconds, one.shared_bytes + one.slot_bytes
         return StageWork(
             f"{count_of(count * channels, 'image')} of {imager.pixels} x {imager.pixels} by {type(imager).__name__}, "
             f"from {si_prefix(64 * count * run.visibilities, 'B')} of files",
             seconds=count * (imager.passes * KEEPING * run.visibilities + through),
             block_bytes=3 * 64.0 * float(np.prod(run.block)),
-            finish_bytes=count * imager.planes_held * channels * plane,
+            finish_bytes=count * imager.planes_held * channels * plane + held,
             result_bytes=count * imager.planes_made * channels * plane,
             wrong=imager.error(),
             remedy="lower image.pixels, or the number of channels",
