@@ -15,7 +15,11 @@ from instrument.errors import FileError, warn
 
 PARTIAL = ".instrument-partial"  # ends the names of folders that are being written
 # files that a folder of data is told by, and what it is
-OF_DATA = {"table.dat": "a Measurement Set", "zarr.json": "data in Zarr", ".zgroup": "data in Zarr"}
+OF_DATA = {  # a file that is in every one of them, and how it begins
+    "table.dat": (b"\xbe\xbe\xbe\xbe", "a Measurement Set"),
+    "zarr.json": (b"", "data in Zarr"),
+    ".zgroup": (b"", "data in Zarr"),
+}
 
 
 @contextmanager
@@ -47,12 +51,23 @@ def beside(target: Path) -> Iterator[Path]:
 
 
 def inside_data(target: Path) -> str:
-    """In which folder of data a path lies, and what that is; "" where it lies in none."""
-    for parent in target.resolve().parents:
-        for mark, what in OF_DATA.items():
-            if (parent / mark).is_file():
-                return f"it lies in {parent.name}, {what}"
+    """In which folder of data a path lies, and what that is; "" where it lies in none, or in a folder of ours in it.
+
+    A link is where it stands, and not where it leads; what cannot be looked at is left to those who write there.
+    """
+    with contextlib.suppress(OSError, RuntimeError, ValueError):  # RuntimeError: a loop of links
+        for parent in (target.parent.resolve() / target.name).parents:
+            if parent.name.endswith(PARTIAL):
+                return ""
+            for mark, (begins, what) in OF_DATA.items():
+                if (parent / mark).is_file() and _begins(parent / mark, begins):
+                    return f"it lies in {parent.name}, {what}"
     return ""
+
+
+def _begins(file: Path, with_bytes: bytes) -> bool:
+    with file.open("rb") as there:
+        return there.read(len(with_bytes)) == with_bytes
 
 
 def locked_folder(target: Path) -> tuple[Path, int | None]:

@@ -64,7 +64,7 @@ def whole_folder(path: str | os.PathLike[str], mark: str, overwrite: bool = Fals
 
 def free_folder(target: Path, mark: str, overwrite: bool) -> None:
     """Raise `InputError` where `whole_folder` would."""
-    _demand_outside(target)
+    _demand_place(target)
     if not os.path.lexists(target):
         return
     if target.is_symlink() or not (target / mark).is_file():
@@ -75,16 +75,16 @@ def free_folder(target: Path, mark: str, overwrite: bool) -> None:
 
 def free_file(target: Path, overwrite: bool) -> None:
     """Raise `InputError` where `whole_file` would."""
-    if "\0" in str(target):
-        raise InputError(f"{str(target)!r}: a name of a file holds no null byte")
-    _demand_outside(target)
+    _demand_place(target)
     if os.path.lexists(target) and (not overwrite or (target.is_dir() and not target.is_symlink())):
         remedy = "choose another name" if target.is_dir() else "give overwrite=True, or another name"
         raise InputError(f"{target} exists: {remedy}")
 
 
-def _demand_outside(target: Path) -> None:
-    """Raise `InputError` for a place within a folder of data, of which what is written would become a part."""
+def _demand_place(target: Path) -> None:
+    """Raise `InputError` for no name, and for a place within a folder of data, of which it would become a part."""
+    if "\0" in str(target):
+        raise InputError(f"{str(target)!r}: a name of a file holds no null byte")
     if within := inside_data(target):
         raise InputError(f"{target}: {within}: choose another place")
 

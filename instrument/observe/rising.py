@@ -18,6 +18,7 @@ STRIDE_S = 480.0  # between times at which all directions are looked at
 SLACK = 1.05  # of the bend: a leap second, light that is bent otherwise at another time
 BLOCK = 4096  # times held at once
 SINES = 4_000_000  # sines held at once: 32 MB
+MANY = 0.3  # of the spans of a direction: where more may hold an extreme of it, all times are looked at
 STEEP = 1e-6  # from 1: 1 - up² has lost 6 digits there, and all of them at the zenith
 
 
@@ -77,7 +78,7 @@ def rising(earth: EarthFrame, slots_s: Float, vectors: Float, normals: Float) ->
 def rising_seen(seen: Float, normals: Float) -> Rising:
     """Of directions whose apparent ITRF unit vectors (T, S, 3) are known, every one of them looked at."""
     found = Rising.unknown(seen.shape[1])
-    step = max(1, int(SINES / (seen.shape[1] * len(normals))))
+    step = max(1, int(SINES / max(1, seen.shape[1] * len(normals))))
     for begin in range(0, len(seen), step):
         here = seen[begin : begin + step]
         up = here @ normals.T
@@ -126,18 +127,40 @@ def _look(found: Rising, vectors: Float, some: _Turned, looked: Int) -> None:
     """Look at directions at some times, then in the middle between those where an extreme of one may lie, and so on."""
     up = some.earth[looked].sines(vectors, some.normals)
     found.take(up)
-    s, t, g = np.nonzero(np.abs(up) > 1 - STEEP)
-    for part in _pieces(len(s)):
-        np.minimum.at(found.zenith, s[part], some.sines(vectors[s[part]], looked[t[part]], g[part])[1])
+    _look_up(found, vectors, some, looked, up)
     if len(looked) == len(some.earth):
         return
     bend = _bend(np.diff(some.turned[looked]))[:, None]
     top, low = np.maximum(up[:, :-1], up[:, 1:]) + bend, np.minimum(up[:, :-1], up[:, 1:]) - bend
-    s, t, g = np.nonzero(_may_hold(top, low, *(x[:, None, None] for x in found)))
+    spans = _may_hold(top, low, *(x[:, None, None] for x in found))
+    if (still := spans.mean(axis=(1, 2)) > MANY).any():  # a pole overhead: heights that never change
+        every = Rising(*(x[still] for x in found))
+        _look_at_all(every, vectors[still], some)
+        for here, there in zip(found, every, strict=True):
+            here[still] = there
+        spans[still] = False
+    s, t, g = np.nonzero(spans)
     for part in _pieces(len(s)):
         where, plane, first = s[part], g[part], t[part]
         ends = up[where, first, plane], up[where, first + 1, plane]
         _halve(found, vectors, some, where, plane, (looked[first], looked[first + 1]), ends)
+
+
+def _look_up(found: Rising, vectors: Float, some: _Turned, times: Int, up: Float) -> None:
+    """Distances from zeniths where sines (S, T, G) at some times tell that they are small."""
+    s, t, g = np.nonzero(np.abs(up) > 1 - STEEP)
+    for part in _pieces(len(s)):
+        np.minimum.at(found.zenith, s[part], some.sines(vectors[s[part]], times[t[part]], g[part])[1])
+
+
+def _look_at_all(found: Rising, vectors: Float, some: _Turned) -> None:
+    """Look at every time."""
+    step = max(1, int(SINES / (len(vectors) * len(some.normals))))
+    for begin in range(0, len(some.earth), step):
+        times = np.arange(begin, min(begin + step, len(some.earth)))
+        up = some.earth[times].sines(vectors, some.normals)
+        found.take(up)
+        _look_up(found, vectors, some, times, up)
 
 
 def _halve(

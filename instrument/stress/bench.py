@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from instrument.errors import RefusedError
+from instrument.errors import InstrumentError, RefusedError
 from instrument.jones.base import JonesTerm
 from instrument.jones.chain import Chain
 from instrument.model import Composed
@@ -32,6 +32,7 @@ from instrument.visibilities import Visibilities
 CENTRE = Direction(0.0, 0.0)  # ITRF x: the w axis, and the zenith of the stations
 AXES = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])  # p, q, r are u, v, w
 GROUND = 6.4e6
+EXACT = 1e-11  # a bound of rounding
 TOLERANCES = (0.0, 1e-9, 1e-6, 1e-3)  # that an engine is asked for, one after the other
 
 
@@ -87,16 +88,21 @@ def problem(uvw_m: Any, sky: PointSky, *terms: JonesTerm, freq_hz: Any = LIGHT) 
 def ready(engine: Predictor, given: Problem) -> Prepared:
     """An engine made ready for a problem at the least tolerance that it takes: 0, or one above it if it approximates.
 
-    Raises `Unfit` with its reason where it refuses the problem, or all tolerances.
+    Raises `Unfit` with its reason where it refuses the problem, or all tolerances; `InstrumentError` where its bound is
+    above what it was asked for.
     """
     if why := engine.refuses(given):
         raise Unfit(why)
     said: Exception | None = None
     for tolerance in TOLERANCES:
         try:
-            return engine.prepare(given, tolerance)
+            found = engine.prepare(given, tolerance)
         except RefusedError as error:
             said = error
+            continue
+        if not found.bound <= max(tolerance, EXACT):
+            raise InstrumentError(f"it takes a tolerance of {tolerance:g}, and then gives a bound of {found.bound:.1e}")
+        return found
     raise Unfit(str(said))
 
 

@@ -113,6 +113,14 @@ def test_the_scatter_is_that_of_the_cells_that_few_baselines_leave(filled, taper
     assert np.all(np.std(ratios, axis=0, ddof=1)[2:] > 1.3 * np.mean(plain, axis=0)[2:])
 
 
+@pytest.mark.filterwarnings("error")
+def test_where_nothing_was_injected_there_is_no_scatter_and_no_noise_of_numpy():
+    signal = white(1)
+    for how, more in ((Transform(stokes="P"), {"bins": 4}), (Transform(), {"bins": np.array([50, 60, 70]) / u.Mpc})):
+        found = recovered_power(signal, signal, how=how, **more)
+        assert np.isnan(found.ratio_sigma).all() and np.isnan(found.transfer_sigma).all()
+
+
 def test_natural_weights_make_the_scatter_of_a_spectrum_larger_than_even_ones():
     """What docs/spectra.md says: 59 LOFAR stations, 8 h, 480 pixels of 0.5 arcmin, bins of a third in uv."""
     layout = instrument.load("telescopes", "lofar-hba").layout()

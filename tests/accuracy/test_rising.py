@@ -27,11 +27,11 @@ TIMES = {
 }
 
 
-def sampling(seconds, ra, dec, spread=4e4, stations=9):
+def sampling(seconds, ra, dec, spread=4e4, stations=9, latitude=0.92):
     """Stations that lie on the round Earth, every one with axes of its own."""
     rng = np.random.default_rng(1)
     enu = np.concatenate([rng.uniform(-spread, spread, (stations, 2)), np.zeros((stations, 1))], axis=1)
-    layout = Layout.from_enu([str(k) for k in range(stations)], enu * u.m, 0.12 * u.rad, 0.92 * u.rad, 50 * u.m)
+    layout = Layout.from_enu([str(k) for k in range(stations)], enu * u.m, 0.12 * u.rad, latitude * u.rad, 50 * u.m)
     tilted = Rotation.from_rotvec(rng.normal(size=(stations, 3)) * 5e-3).as_matrix()
     layout = layout.with_fields(axes=tilted @ layout.axes)
     times = Time("2012-12-07T01:00:00", scale="utc") + seconds * u.s
@@ -72,6 +72,19 @@ def test_few_times_are_looked_at(monkeypatch):
 def _counted(found, looked):
     looked.append(np.size(found[0] if isinstance(found, tuple) else found))
     return found
+
+
+def test_at_a_pole_where_heights_never_change_all_times_are_looked_at_once(monkeypatch):
+    """Nothing can be left out there: halving would look at every time as well, and take ten times as long."""
+    looked, other = [], module._Turned.sines
+    monkeypatch.setattr(module._Turned, "sines", lambda *a: _counted(other(*a), looked))
+    at = sampling(np.arange(0, 8 * 3600, 20.0), *sky(), spread=0.0, latitude=np.pi / 2)
+    upright = np.broadcast_to([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]], (9, 3, 3))
+    at = replace(at, layout=at.layout.with_fields(axes=upright))
+    found, up = at.rising, at.local[..., 2]
+    np.testing.assert_allclose(found.highest, up.max(axis=(0, 1)), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(found.lowest, up.min(axis=(0, 1)), rtol=0, atol=1e-14)
+    assert sum(looked) < 0.05 * up.size
 
 
 def test_some_directions_keep_what_was_found_of_them():

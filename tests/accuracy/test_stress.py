@@ -9,7 +9,7 @@ import pytest
 from astropy.table import Table
 
 from instrument.cli import main
-from instrument.errors import InputError
+from instrument.errors import InputError, RefusedError
 from instrument.foreground.base import ForegroundRemover
 from instrument.jones.base import ElementBeam
 from instrument.mat2 import pack
@@ -160,11 +160,14 @@ class Rough(Direct):
     """Wrong by 1e-6 of the flux, of which it says this much."""
 
     says: float = 0.0
+    boasts: bool = False  # that it takes any tolerance
 
     def sums(self, problem):
         return Direct().sums(problem) + 5e-7 * (1 + 1j)
 
     def prepare(self, problem, tolerance):
+        if tolerance < self.says and not self.boasts:
+            raise RefusedError("give a larger tolerance")
         return replace(super().prepare(problem, tolerance), bound=self.says)
 
 
@@ -172,6 +175,8 @@ def test_an_engine_that_approximates_is_held_to_what_it_says_of_itself():
     tried = [c for c in all_cases() if c.stage == "engines" and c.key in ("1", "5", "9", "10", "16", "X1")]
     assert {judged(c, Rough(says=2e-9)).verdict for c in tried} == {WRONG}
     assert {judged(c, Rough(says=2e-6)).verdict for c in tried} == {RIGHT}
+    assert {judged(c, Rough(says=10.0, boasts=True)).verdict for c in tried} == {WRONG}
+    assert {judged(c, Rough(says=1e9, boasts=True)).verdict for c in tried} == {WRONG}
 
 
 class Greedy(ForegroundRemover):

@@ -6,8 +6,10 @@ import pytest
 from astropy import units as u
 
 import instrument
+from instrument import MeasurementSet
 from instrument.cli import main
-from instrument.errors import InputError
+from instrument.errors import FileError, InputError
+from instrument.files.formats import demand_free
 from instrument.pipeline.folder import RunFolder
 from instrument.units import Direction
 
@@ -125,3 +127,36 @@ def test_no_writer_of_files_writes_into_a_folder_of_data(small_set, here, name):
     with pytest.raises(InputError, match=r"it lies in (a.MS|HISTORY), a Measurement Set: choose another place"):
         sky.write(here / name)
     assert tree(here) == before
+
+
+def test_what_only_looks_like_data_and_sets_within_sets_are_written(small_set, here):
+    """A text called table.dat is no set; a set within a set (a multi-MS has such) gets its columns."""
+    sky = instrument.load("skies", "grid", shape=(1, 2), spacing=1 * u.deg, flux=5 * u.Jy).about(Direction(2.15, 0.84))
+    (here / "mine").mkdir()
+    (here / "mine" / "table.dat").write_text("1 2 3")
+    sky.write(here / "mine" / "sky.csv")
+    shutil.copytree(small_set, here / "m.mms")
+    shutil.copytree(small_set, here / "m.mms" / "SUBMSS" / "m.0000.ms")
+    inner = MeasurementSet(here / "m.mms" / "SUBMSS" / "m.0000.ms")
+    inner.write("MODEL_DATA", inner.blocks())
+    assert len(list(MeasurementSet(inner.path, "MODEL_DATA").blocks())) == 1
+
+
+def test_links_are_where_they_stand(small_set, here):
+    sky = instrument.load("skies", "grid", shape=(1, 2), spacing=1 * u.deg, flux=5 * u.Jy).about(Direction(2.15, 0.84))
+    shutil.copytree(small_set, here / "a.MS")
+    (here / "a.MS" / "in.csv").symlink_to(here / "real.csv")
+    with pytest.raises(InputError, match=r"it lies in a\.MS"):
+        sky.write(here / "a.MS" / "in.csv", overwrite=True)
+    (here / "out.csv").symlink_to(here / "a.MS" / "t.csv")
+    sky.write(here / "out.csv", overwrite=True)
+    assert not (here / "out.csv").is_symlink() and not (here / "a.MS" / "t.csv").exists()
+    for loop, other in (("p", "q"), ("q", "p")):
+        (here / loop).symlink_to(here / other)
+    with pytest.raises(FileError):
+        sky.write(here / "p" / "x.csv")
+    with pytest.raises(FileError):
+        sky.write(here / ("x" * 300) / "y.csv")
+    for name in ("a\0.csv", "a\0.zarr"):
+        with pytest.raises(InputError, match="no null byte"):
+            demand_free(str(here / name), True) if name.endswith("zarr") else sky.write(here / name)

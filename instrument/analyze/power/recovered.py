@@ -102,16 +102,22 @@ class Recovered:
 
         `alone`: of one power with itself, of which that of a mode is 2 P², and of the mean of two, both signs, 3/2 P².
         """
-        unit, folds = np.nanmax(self.injected.power), self.injected.cells.folds
+        unit, folds = self._unit, self.injected.cells.folds
         return self.injected.mean(
             lambda m, cells: (one[m, cells] / unit) * (two[m, cells] / unit) / (1 + 1 / folds[m] if alone else 1)
         )
 
     def _scatter(self, variance: Float) -> Float:
         """Of the mean over modes of what has so much of it in each, over power injected."""
-        unit = np.nanmax(self.injected.power)
         with np.errstate(invalid="ignore", divide="ignore"):
-            return np.asarray(np.sqrt(self._over(variance * unit) / (self.injected.power / unit) / self._modes))
+            share = self._over(variance * self._unit) / (self.injected.power / self._unit)
+            return np.asarray(np.sqrt(share / self._modes))
+
+    @property
+    def _unit(self) -> float:
+        """The largest power injected, or 1 where none was."""
+        most = float(np.nanmax(self.injected.power, initial=0.0))
+        return most if most > 0 else 1.0
 
     @property
     def _modes(self) -> Float:
