@@ -220,9 +220,9 @@ def _plan(given: argparse.Namespace) -> int:
         raise InputError(f"--into goes with {', '.join(WRITES)}: '{given.of}' writes no visibilities")
     verbs = [given.of or ""] if given.of or given.data is None else _verbs_for(given)
     refused: dict[str, InputError] = {}
-    for verb in verbs:
+    for number, verb in enumerate(verbs):
         try:
-            _plan_of(given, verb)
+            _plan_of(given, verb, "\n" if number else "")
         except InputError as error:
             refused[verb] = error
     reasons = set(map(str, refused.values()))
@@ -235,11 +235,12 @@ def _plan(given: argparse.Namespace) -> int:
     return DONE
 
 
-def _plan_of(given: argparse.Namespace, verb: str) -> None:
+def _plan_of(given: argparse.Namespace, verb: str, before: str = "") -> None:
     from instrument.pipeline.planning import plan_run
 
     _, scene_file = _scene_file(given, verb)
-    show(str(plan_run(scene_file, scene_file.scene(), given.memory, given.workers, not given.no_verify)))
+    made = plan_run(scene_file, scene_file.scene(), given.memory, given.workers, not given.no_verify)
+    show(f"{before}{made}")
 
 
 def _verbs_for(given: argparse.Namespace) -> list[str]:
