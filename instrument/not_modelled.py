@@ -51,7 +51,7 @@ def _smearing(problem: Problem) -> list[Item]:
         lost = 1 - np.sinc(problem.width_hz * longest / LIGHT * far)
         parts.append(f"over {si_prefix(problem.width_hz, 'Hz')} {_percent(lost)}")
     where = "longest baseline" if problem.uv_range is None else "longest of these baselines"
-    return [Item("smearing", f"{', '.join(parts)} of the farthest source on the {where}: nothing is lost here")]
+    return [Item("smearing", f"{', '.join(parts)} of the farthest source on the {where}; a prediction loses none")]
 
 
 def _percent(lost: float) -> str:

@@ -14,6 +14,7 @@ WRITES = {
     "calibrate": ("data", "CORRECTED_DATA"),
     "subtract": ("difference", "SUBTRACTED_DATA"),
 }
+NEEDS = {"calibrate": 'kind = "selfcal"', "image": "pixels and pixel"}  # of the tables that verbs are about, the least
 HELP = {
     "predict": "Predict the sky of a scene into a column of a Measurement Set, with its times, channels and UVW.",
     "calibrate": "Calibrate the data of a Measurement Set against the sky of a scene, and write them corrected.",
@@ -36,8 +37,7 @@ def tables_on(verb: str, tables: dict[str, Any], data: dict[str, Any], into: str
 
     if not can(verb, tables):
         raise InputError(
-            f"{verb} takes its settings from a table [{verb}], which the scene has not: write one, as [{verb}] alone"
-            + (' with kind = "selfcal"' if verb == "calibrate" else "")
+            f"{verb} takes its settings from a table [{verb}], which the scene has not: write one, with {NEEDS[verb]}"
         )
     kept = {name: value for name, value in tables.items() if name in (*OWN, *STAGES[verb])}
     if not Path(data["set"]).is_dir():

@@ -2,6 +2,7 @@
 
 import copy
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -111,6 +112,21 @@ def test_the_scatter_is_that_of_the_cells_that_few_baselines_leave(filled, taper
     pulls = (np.array([np.std(x, axis=0, ddof=1) for x in (ratios, transfers)]) / sigma)[:, 2:]
     np.testing.assert_allclose(pulls, 1, atol=0.3)  # 60 draws tell each to 9 %
     assert np.all(np.std(ratios, axis=0, ddof=1)[2:] > 1.3 * np.mean(plain, axis=0)[2:])
+
+
+def test_cells_are_compared_where_the_signal_has_them_in_whatever_order_and_number():
+    """Cells that a PSF is too weak for are in one cube and not in another: there is no power of it."""
+    signal, rng = white(1), np.random.default_rng(2)
+    found = recovered_power(signal.with_data(signal.data + white(2).data), signal, bins=4)
+    cells = found.recovered.cells
+    order = rng.permutation(len(cells.k_perp))
+    for kept, due in (
+        (order, cells.power),
+        (np.arange(1, len(order)), np.where(np.arange(len(order)), cells.power, 0)),
+    ):
+        taken = {name: getattr(cells, name)[kept] for name in ("k_perp", "times", "v_index", "u_index")}
+        other = replace(found.recovered, cells=replace(cells, power=cells.power[:, kept], **taken))
+        np.testing.assert_array_equal(replace(found, recovered=other)._placed(other), due)
 
 
 @pytest.mark.filterwarnings("error")
